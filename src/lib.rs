@@ -1,0 +1,2 @@
+//! Ada-Diffuser: infer a hidden context from a few time steps, and let a causal diffusion model plan with it.
+pub mod model;

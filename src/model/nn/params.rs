@@ -1,0 +1,118 @@
+//! Named parameters: where a network gets its weights from, fresh (seeded) or loaded (checked).
+
+use crate::model::noise::Philox;
+use candle_core::{DType, Device, Result, Shape, Tensor, Var};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::{Arc, Mutex},
+};
+
+/// How a fresh parameter is drawn; the bounds follow PyTorch's defaults so that a PyTorch user finds what they expect.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Init {
+    /// All entries equal to this value.
+    Const(f32),
+    /// Uniform in `+-1/sqrt(fan_in)`: `nn.Linear`, `nn.Conv1d`, `nn.GRU` (with `fan_in` = hidden size).
+    FanIn(usize),
+    /// Gaussian with this standard deviation.
+    Normal(f32),
+}
+
+enum Source {
+    Fresh { seed: u64, vars: BTreeMap<String, Var> },
+    Loaded { tensors: BTreeMap<String, Tensor>, used: BTreeSet<String> },
+}
+
+/// A scope in a parameter store: `params.scope("down").scope("0").get(&[32, 23, 5], "weight", init)` is the tensor `down.0.weight`.
+///
+/// In a *fresh* store every parameter is a trainable variable, drawn from the seed and its own name (so adding a layer does not
+/// move the others). In a *loaded* store parameters are constants: layers may pack them once.
+#[derive(Clone)]
+pub struct Params {
+    source: Arc<Mutex<Source>>,
+    prefix: String,
+}
+
+impl Params {
+    /// An empty trainable store.
+    pub fn fresh(seed: u64) -> Self {
+        Self { source: Arc::new(Mutex::new(Source::Fresh { seed, vars: BTreeMap::new() })), prefix: String::new() }
+    }
+
+    /// A store of constants, by full name.
+    pub fn loaded(tensors: BTreeMap<String, Tensor>) -> Self {
+        Self { source: Arc::new(Mutex::new(Source::Loaded { tensors, used: BTreeSet::new() })), prefix: String::new() }
+    }
+
+    /// The same store, one name deeper.
+    pub fn scope(&self, name: impl std::fmt::Display) -> Self {
+        let prefix = if self.prefix.is_empty() { name.to_string() } else { format!("{}.{name}", self.prefix) };
+        Self { source: self.source.clone(), prefix }
+    }
+
+    /// Whether the parameters are constants (inference), so that a layer may pack them at construction.
+    pub fn is_frozen(&self) -> bool {
+        matches!(*self.lock(), Source::Loaded { .. })
+    }
+
+    /// The parameter `name` of this scope with this shape.
+    ///
+    /// # Errors
+    /// In a loaded store: no such tensor, another shape, or another type than f32.
+    pub fn get(&self, shape: impl Into<Shape>, name: &str, init: Init) -> Result<Tensor> {
+        let (shape, name) = (shape.into(), if self.prefix.is_empty() { name.into() } else { format!("{}.{name}", self.prefix) });
+        match &mut *self.lock() {
+            Source::Fresh { seed, vars } => {
+                if let Some(var) = vars.get(&name) {
+                    return Ok(var.as_tensor().clone());
+                }
+                let var = Var::from_tensor(&draw(*seed, &name, &shape, init)?)?;
+                let tensor = var.as_tensor().clone();
+                vars.insert(name, var);
+                Ok(tensor)
+            }
+            Source::Loaded { tensors, used } => {
+                let tensor = tensors.get(&name).ok_or_else(|| candle_core::Error::Msg(format!("tensor {name} is missing")))?;
+                if *tensor.shape() != shape || tensor.dtype() != DType::F32 {
+                    candle_core::bail!("tensor {name} is {:?} {:?}, expected F32 {shape:?}", tensor.dtype(), tensor.shape());
+                }
+                used.insert(name);
+                Ok(tensor.clone())
+            }
+        }
+    }
+
+    /// All trainable variables by name; empty for a loaded store.
+    pub fn vars(&self) -> BTreeMap<String, Var> {
+        match &*self.lock() {
+            Source::Fresh { vars, .. } => vars.clone(),
+            Source::Loaded { .. } => BTreeMap::new(),
+        }
+    }
+
+    /// Names in a loaded store that no network asked for; empty for a fresh one.
+    pub fn unused(&self) -> Vec<String> {
+        match &*self.lock() {
+            Source::Fresh { .. } => Vec::new(),
+            Source::Loaded { tensors, used } => tensors.keys().filter(|name| !used.contains(*name)).cloned().collect(),
+        }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Source> {
+        self.source.lock().expect("no code panics while it holds the parameter store: is a bug")
+    }
+}
+
+fn draw(seed: u64, name: &str, shape: &Shape, init: Init) -> Result<Tensor> {
+    let count = shape.elem_count();
+    let mut noise = Philox::named(seed, name);
+    let values: Vec<f32> = match init {
+        Init::Const(value) => vec![value; count],
+        Init::FanIn(fan_in) => {
+            let bound = 1.0 / (fan_in.max(1) as f32).sqrt();
+            (0..count).map(|_| bound * (2.0 * noise.uniform() - 1.0)).collect()
+        }
+        Init::Normal(std) => (0..count).map(|_| std * noise.normal()).collect(),
+    };
+    Tensor::from_vec(values, shape.clone(), &Device::Cpu)
+}
