@@ -1,3 +1,7 @@
 //! What Ada-Diffuser is: tensors in, tensors out. No clock, no thread, no socket, no hidden randomness.
+pub mod agent;
+pub mod checkpoint;
 pub mod nn;
 pub mod noise;
+pub mod normalizer;
+pub mod trajectory;
