@@ -33,6 +33,40 @@ pub struct ModelConfig {
     pub refined: bool,
     /// Root mean square spread of the prior's latent mean over the training data (all dimensions pooled): the yardstick of a latent jump.
     pub latent_spread: f32,
+    /// When a streaming window is not trusted any more.
+    #[serde(default)]
+    pub restart: Restart,
     /// Sampling defaults.
     pub sampler: SamplerOptions,
+}
+
+/// When a stored window is noised again or thrown away. Distances of states are root mean squares in standard deviations of the data.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Restart {
+    /// From this distance between the real and the predicted state on, the window is noised again by a quarter of its rungs.
+    pub renoise_distance: f32,
+    /// From this distance on, it starts cold.
+    pub cold_distance: f32,
+    /// It starts cold when the latent of position 0 has moved by more than this many `latent_spread`s since the last cold start.
+    pub latent_jump: f32,
+}
+
+impl Default for Restart {
+    fn default() -> Self {
+        Self { renoise_distance: 0.5, cold_distance: 1.5, latent_jump: 1.0 }
+    }
+}
+
+impl ModelConfig {
+    /// Bounds a denoised token in place, normalized units: states by `state_clip`, actions by their bounds.
+    pub fn clip(&self, token: &mut [f32]) {
+        let (state, action) = token.split_at_mut(self.layout.state_dim);
+        state.iter_mut().for_each(|value| *value = value.clamp(-self.state_clip, self.state_clip));
+        let affine = &self.normalizer.action;
+        for (j, value) in action.iter_mut().enumerate() {
+            let bound = |raw: f32| (raw - affine.mean[j]) / affine.std[j];
+            *value = value.clamp(bound(self.action_low[j]), bound(self.action_high[j]));
+        }
+    }
 }

@@ -5,7 +5,7 @@ mod gaussian;
 mod heads;
 
 pub use encoder::Encoder;
-pub use gaussian::Gaussian;
+pub use gaussian::{Gaussian, PlainGaussian};
 pub use heads::{Decoder, Prior};
 
 use crate::model::{
