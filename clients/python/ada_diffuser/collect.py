@@ -35,7 +35,7 @@ observations, actions (as executed), rewards, terminals, timeouts, infos/context
 Beside it goes X.card.json: environment, options, seed, returns, expert, SHA-256, the command.
 
 The expert of PointWind is a formula. The cheetah's are trained here by Augmented Random Search (linear policies,
-about a minute for each search, two at a time) and kept beside the data as X.expert.npz; a later call with the same
+one to two minutes for each search, two at a time) and kept beside the data as X.expert.npz; a later call with the same
 environment, options, and expert settings uses that file again. The same arguments give the same bytes."""
 
 EXAMPLES = """\
@@ -70,6 +70,7 @@ class Job:
 def collect(job: Job, expert: Expert, progress: Callable[[range], Iterator[int]] = iter) -> tuple[Episodes, int]:
     """Fly the episodes of one session; returns them and how many failed. A pure function of its arguments."""
     env = environments.make(job.env, **job.options)
+    _check_fit(env, expert)
     env_seed, noise_seed = np.random.SeedSequence(job.seed).generate_state(2)
     rng = np.random.default_rng(noise_seed)
     flown, failures = [], 0
@@ -80,6 +81,13 @@ def collect(job: Job, expert: Expert, progress: Callable[[range], Iterator[int]]
     env.close()
     columns = {name: np.concatenate([getattr(e, name) for e in flown]) for name in Episodes.__dataclass_fields__}
     return Episodes(**columns), failures
+
+
+def _check_fit(env: gym.Env, expert: Expert) -> None:
+    wanted = env.observation_space.shape[0], env.action_space.shape[0]
+    made_for = expert.sizes(len(env.unwrapped.context))
+    if made_for != wanted:
+        raise ValueError(f"the expert is made for observations and actions of {made_for} numbers, the environment has {wanted}")
 
 
 def _fly(env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, seed: int | None) -> Episodes:
@@ -135,7 +143,7 @@ def _parser() -> argparse.ArgumentParser:
     expert.add_argument("--expert", type=Path, metavar="X.npz", help="fly this one instead of training one")
     expert.add_argument("--expert-seed", type=int, default=0, metavar="N", help="of the searches (default 0)")
     expert.add_argument("--expert-searches", type=int, default=3, metavar="N", help="searches for each policy (default 3)")
-    expert.add_argument("--expert-iterations", type=int, default=250, metavar="N", help="updates in a search (default 250)")
+    expert.add_argument("--expert-iterations", type=int, default=300, metavar="N", help="updates in a search (default 300)")
     parser.add_argument("--json", action="store_true", help="print the data card instead of a summary")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     return parser
