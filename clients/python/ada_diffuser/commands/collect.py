@@ -38,7 +38,7 @@ examples:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; 0, or 2 with a line on stderr that names what is wrong. Nothing is written then."""
+    """Entry point; 0; 2 with a line on stderr that names what is wrong; 130 when interrupted. No data set is written then."""
     args = _parser().parse_args(argv)
     command = shlex.join(["ada-collect", *(sys.argv[1:] if argv is None else argv)])
     try:
@@ -47,6 +47,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, TypeError, OSError, ImportError) as error:
         print(f"ada-collect: {sentence(error)}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("ada-collect: interrupted, no data set written", file=sys.stderr)
+        return 130
     print(json.dumps(card, indent=2) if args.json else _summary(card, args.out))
     return 0
 
@@ -158,7 +161,7 @@ def _expert(args: argparse.Namespace, recipe: ExpertRecipe | None) -> Expert:
 def _search_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     from tqdm import tqdm
 
-    with tqdm(desc="expert searches", unit="search", disable=quiet, file=sys.stderr) as bar:
+    with tqdm(desc="expert", unit="iteration", disable=quiet, file=sys.stderr) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total, bar.n = total, done
