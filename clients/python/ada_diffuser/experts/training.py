@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -15,6 +17,7 @@ from .ars import ArsSettings, search
 from .policy import AnalyticPilot, Expert, LinearPolicy, PolicyBank
 
 PROCESSES_MAX = 2
+POLL_S = 0.5
 GAIN_SPREAD = 0.2
 JUDGE_EVERY = 5
 JUDGE_EPISODES = 9
@@ -70,18 +73,12 @@ def recipe_for(env: gym.Env, options: dict[str, Any], seed: int, seeds: int, ars
 def make_expert(recipe: ExpertRecipe | None, progress: Callable[[int, int], None] = lambda done, total: None) -> Expert:
     """Run the searches of a recipe, two at a time; without a recipe, the analytic pilot.
 
-    `progress(done, total)` is called as searches end. The result does not depend on the number of processes.
+    `progress(done, total)` is called now and then with iterations of all searches. The result does not depend on the number
+    of processes.
     """
     if recipe is None:
         return AnalyticPilot()
-    jobs = [(recipe, slot, number) for slot in range(max(1, len(recipe.targets))) for number in range(recipe.seeds)]
-    progress(0, len(jobs))
-    found = []
-    # Spawned, not forked: a fork would copy whatever threads the caller's libraries run.
-    with multiprocessing.get_context("spawn").Pool(min(PROCESSES_MAX, len(jobs))) as pool:
-        for result in pool.imap(_search_job, jobs):
-            found.append(result)
-            progress(len(found), len(jobs))
+    found = _run_searches(recipe, progress)
     slots = [found[i : i + recipe.seeds] for i in range(0, len(found), recipe.seeds)]
     best = [max(slot, key=lambda result: result[1]["fresh"]["mean"]) for slot in slots]
     targets = np.array(recipe.targets) if recipe.targets else None
@@ -92,6 +89,34 @@ def make_expert(recipe: ExpertRecipe | None, progress: Callable[[int, int], None
         "searches": [record for slot in slots for _, record in slot],
     }
     return PolicyBank([policy for policy, _ in best], targets, card)
+
+
+def _run_searches(recipe: ExpertRecipe, progress: Callable[[int, int], None]) -> list[tuple[LinearPolicy, dict[str, Any]]]:
+    """All searches in order: those of the first policy, then those of the next."""
+    jobs = [(recipe, slot, number) for slot in range(max(1, len(recipe.targets))) for number in range(recipe.seeds)]
+    # Spawned, not forked: a fork would copy whatever threads the caller's libraries run.
+    context = multiprocessing.get_context("spawn")
+    done, total = context.Value("q", 0), len(jobs) * recipe.ars.iterations
+    with ProcessPoolExecutor(min(PROCESSES_MAX, len(jobs)), context, _start_worker, (done,)) as pool:
+        futures = [pool.submit(_search_job, *job) for job in jobs]
+        try:
+            while (state := wait(futures, POLL_S, FIRST_EXCEPTION)).not_done and not any(f.exception() for f in state.done):
+                progress(done.value, total)
+            return [future.result() for future in futures]
+        finally:
+            progress(done.value, total)
+            pool.shutdown(cancel_futures=True)
+
+
+_iterations_done: Any = None
+"""In a worker: the counter shared by all searches."""
+
+
+def _start_worker(done: Any) -> None:
+    global _iterations_done
+    _iterations_done = done
+    # An interrupt at the terminal reaches workers too: end at once and in silence, the parent says what there is to say.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class _Course:
@@ -142,14 +167,15 @@ class _Course:
         return total, np.array(visited, np.float64)
 
 
-def _search_job(job: tuple[ExpertRecipe, int, int]) -> tuple[LinearPolicy, dict[str, Any]]:
+def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> tuple[LinearPolicy, dict[str, Any]]:
     """One search: the best iterate on evaluation episodes, and what it reaches on fresh ones."""
-    recipe, slot, number = job
     course = _Course(recipe, slot)
     search_rng, judge_rng, fresh_rng = (np.random.default_rng([recipe.seed, slot, number, part]) for part in range(3))
     judge_seeds = judge_rng.integers(2**31, size=JUDGE_EPISODES)
     best, best_score, best_iteration = None, -np.inf, 0
     for iteration, policy in enumerate(search(course.practise, course.shape, recipe.ars, search_rng), start=1):
+        with _iterations_done.get_lock():
+            _iterations_done.value += 1
         if iteration % JUDGE_EVERY and iteration != recipe.ars.iterations:
             continue
         score = float(course.judge(policy, judge_seeds, recipe.judge_noise).mean())
