@@ -1,5 +1,6 @@
 //! How checkpoints are made: recipe -> data set -> stage 1 -> stage 2 -> checkpoint. Losses live beside the networks they train
 //! (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here the crank is turned.
+pub mod ceiling;
 pub mod dataset;
 pub mod learner;
 pub mod log;
@@ -16,7 +17,7 @@ pub mod tensorboard;
 
 use crate::model::config::ModelConfig;
 use crate::model::diffusion::refine::LatentRouting;
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Result, bail, ensure};
 use dataset::{Split, hdf5};
 use learner::{Learner, Scalars};
 use log::{Clock, Log};
@@ -95,6 +96,7 @@ impl Task {
             normalizer: split.normalizer.clone(),
             refined: recipe.model.latent.is_some() && recipe.stage2.routing == LatentRouting::Matched,
             latent_spread: 0.0,
+            restart: recipe.restart,
             sampler: recipe.sampler.clone(),
         };
         Ok(Self { recipe, split, dataset_digest: dataset.digest, config })
@@ -175,10 +177,8 @@ impl Crank<'_> {
     /// Probes where the data have a context; without a gate everything passes.
     fn passes_gate(&mut self, learner: &mut Learner) -> Result<bool> {
         let task = self.task;
-        if task.split.train[0].context_dim == 0 {
-            return Ok(true);
-        }
-        let result = stage1::gate(task, learner)?;
+        let Some(latent) = learner.networks.latent.as_ref().filter(|_| task.split.train[0].context_dim > 0) else { return Ok(true) };
+        let result = stage1::gate(task, latent)?;
         self.log.write(&learner.position, &[("probe_filter", result.filter), ("probe_successor_state", result.successor_state)])?;
         if let Some(probes) = learner.probes.as_array_mut() {
             probes.push(serde_json::to_value(result)?);
@@ -220,10 +220,19 @@ impl Crank<'_> {
             learner.position.step += 1;
             self.log.step(&learner.position, recipe.log_every, &scalars)?;
             if learner.position.step.is_multiple_of(recipe.checkpoint_every) {
-                self.store.save(&learner.snapshot())?;
+                self.checkpoint(learner)?;
             }
         }
         Ok(Outcome::Finished)
+    }
+
+    /// The training state, and in stage 2 a checkpoint that can already be served.
+    fn checkpoint(&self, learner: &Learner) -> Result<()> {
+        self.store.save(&learner.snapshot())?;
+        if learner.position.stage == Stage::Refine {
+            ship::ship(self.task, learner, self.out, &self.log)?;
+        }
+        Ok(())
     }
 
     fn should_stop(&mut self) -> bool {

@@ -2,7 +2,7 @@
 
 use super::optimizer::LearningRate;
 use crate::model::{
-    agent::SamplerOptions, denoiser::DenoiserConfig, diffusion::refine::LatentRouting, latent::LatentConfig,
+    agent::SamplerOptions, config::Restart, denoiser::DenoiserConfig, diffusion::refine::LatentRouting, latent::LatentConfig,
 };
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -66,6 +66,9 @@ pub struct Recipe {
     pub stage2: Stage2,
     /// Sampling defaults that go into the checkpoint.
     pub sampler: SamplerOptions,
+    /// When a streaming window is not trusted any more; goes into the checkpoint.
+    #[serde(default)]
+    pub restart: Restart,
 }
 
 /// Architecture; the fields are those of [`crate::model::config::ModelConfig`].
@@ -192,7 +195,12 @@ impl Recipe {
 
     /// The recipe as TOML, as it goes into the manifest.
     pub fn to_toml(&self) -> String {
-        toml::to_string(self).expect("a recipe came from TOML: is a bug")
+        let mut table = toml::Table::try_from(self).expect("a recipe came from TOML: is a bug");
+        if let (true, Some(sampler)) = (self.sampler.kappa.is_infinite(), table.get_mut("sampler").and_then(toml::Value::as_table_mut)) {
+            // Infinity is serialised as null, which JSON needs and TOML leaves out.
+            sampler.insert("kappa".into(), toml::Value::Float(f64::INFINITY));
+        }
+        toml::to_string(&table).expect("a table is TOML: is a bug")
     }
 
     /// Steps an episode must have, and the keys that ask for them.

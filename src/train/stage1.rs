@@ -10,7 +10,13 @@ use super::{
     probe::{Evidence, Subjects, latent_probe},
     recipe::{Gate, Recipe, Stage1},
 };
-use crate::model::latent::elbo::{ElboBatch, ElboOptions};
+use crate::model::{
+    latent::{
+        LatentModel,
+        elbo::{ElboBatch, ElboOptions},
+    },
+    noise::Philox,
+};
 use anyhow::{Context, Result};
 use candle_core::Tensor;
 use serde::Serialize;
@@ -47,7 +53,7 @@ impl<'a> ElboTask<'a> {
     ///
     /// # Errors
     /// If a tensor operation fails.
-    pub fn batch(&self, rng: &mut crate::model::noise::Philox) -> Result<ElboBatch> {
+    pub fn batch(&self, rng: &mut Philox) -> Result<ElboBatch> {
         Ok(blocks(&self.task.split.train, &self.places, &self.shape, rng)?)
     }
 
@@ -108,8 +114,7 @@ impl GateResult {
 ///
 /// # Errors
 /// If the data have no context, or a tensor operation fails.
-pub fn gate(task: &Task, learner: &Learner) -> Result<GateResult> {
-    let latent = learner.networks.latent.as_ref().context("the gate needs a latent model: is a bug")?;
+pub fn gate(task: &Task, latent: &LatentModel) -> Result<GateResult> {
     let subjects = Subjects { train: &task.split.train, held_out: &task.split.held_out, rows_max: GATE_ROWS };
     let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.config.block_len, &[0])?[0].error) };
     Ok(GateResult { filter: error(Evidence::Filter)?, successor_state: error(Evidence::SuccessorState)? })
