@@ -14,6 +14,10 @@ pub mod kernels;
 pub mod linear;
 pub mod norm;
 pub mod params;
+#[cfg(test)]
+mod testing;
+#[cfg(test)]
+mod tests;
 pub mod time_embedding;
 
 pub use activation::{gelu_tanh, mish, relu, silu};
