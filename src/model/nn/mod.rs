@@ -6,6 +6,8 @@
 
 pub mod activation;
 pub mod attention;
+#[cfg(test)]
+mod candle_faults;
 pub mod conv1d;
 pub mod gru;
 mod host;

@@ -166,3 +166,59 @@ fn wrong_shapes_are_errors() {
     assert!(concat_channels(&[&gaussian(1, (2, 4, 8)), &gaussian(1, (2, 3, 8))]).is_err());
     assert!(add_channel_bias(&gaussian(1, (2, 4, 8)), &gaussian(1, (2, 7))).is_err());
 }
+
+/// `tests/golden/make_nn.py` tells how PyTorch made these numbers, in float64.
+#[test]
+fn layers_against_pytorch() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/nn.safetensors");
+    let golden = candle_core::safetensors::load(path, &candle_core::Device::Cpu).unwrap();
+    let conv = |c_out, kernel, stride, padding| ConvShape { c_in: 6, c_out, kernel, stride, padding };
+    let single = |layer: fn(&Tensor) -> Result<Tensor>| -> Layer { Box::new(move |x, _| layer(x)) };
+    let cases: Vec<(&str, Layer)> = vec![
+        ("linear", Box::new(|x, p| Linear::new(7, 35, p)?.forward(x))),
+        ("conv", Box::new(move |x, p| Conv1d::new(conv(20, 5, 1, 2), p)?.forward(x))),
+        ("conv_stride", Box::new(move |x, p| Conv1d::new(conv(10, 3, 2, 1), p)?.forward(x))),
+        ("conv_transpose", Box::new(move |x, p| ConvTranspose1d::new(conv(10, 4, 2, 1), p)?.forward(x))),
+        ("group_norm_mish", Box::new(|x, p| GroupNormMish::new(4, 20, p)?.forward(x))),
+        ("layer_norm", Box::new(|x, p| LayerNorm::new(21, true, 1e-5, p)?.forward(x))),
+        ("layer_norm_plain", Box::new(|x, p| LayerNorm::new(21, false, 1e-6, p)?.forward(x))),
+        ("attention", single(|x| attention(x, 2))),
+        ("mish", single(mish)),
+        ("silu", single(silu)),
+        ("gelu_tanh", single(gelu_tanh)),
+        ("relu", single(relu)),
+    ];
+    for (name, layer) in cases {
+        compare(&golden, name, &["x"], &|inputs, p| layer(&inputs[0], p));
+    }
+    compare(&golden, "gru", &["x", "h0"], &|inputs, p| Gru::new(6, 9, p)?.forward(&inputs[0], &inputs[1]));
+    let sinusoid = time_embedding::sinusoid(&golden["sinusoid.x"], 32).unwrap();
+    assert!(distance(&flat(&sinusoid), &flat(&golden["sinusoid.y"])) < 1e-6);
+}
+
+/// Result and every gradient of one golden case, within a few roundings.
+fn compare(
+    golden: &std::collections::HashMap<String, Tensor>,
+    name: &str,
+    inputs: &[&str],
+    layer: &dyn Fn(&[Tensor], &Params) -> Result<Tensor>,
+) {
+    let prefix = format!("{name}.p.");
+    let parameters: BTreeMap<String, Tensor> =
+        golden.iter().filter_map(|(key, value)| Some((key.strip_prefix(&prefix)?.to_owned(), value.clone()))).collect();
+    let vars = |named: Vec<(String, Tensor)>| -> Vec<(String, candle_core::Var)> {
+        named.into_iter().map(|(key, value)| (key, candle_core::Var::from_tensor(&value).unwrap())).collect()
+    };
+    let inputs = vars(inputs.iter().map(|key| ((*key).to_owned(), golden[&format!("{name}.{key}")].clone())).collect());
+    let parameters = vars(parameters.into_iter().collect());
+    let store = parameters.iter().map(|(key, var)| (key.clone(), var.as_tensor().clone())).collect();
+    let tensors: Vec<Tensor> = inputs.iter().map(|(_, var)| var.as_tensor().clone()).collect();
+    let y = layer(&tensors, &Params::loaded(store)).unwrap();
+    assert!(distance(&flat(&y), &flat(&golden[&format!("{name}.y")])) < 2e-6, "{name}: result");
+    let grads = (&y * &golden[&format!("{name}.r")]).unwrap().sum_all().unwrap().backward().unwrap();
+    let named = inputs.iter().map(|(key, var)| (format!("{name}.d{key}"), var));
+    for (key, var) in named.chain(parameters.iter().map(|(key, var)| (format!("{name}.dp.{key}"), var))) {
+        let error = distance(&flat(grads.get(var).expect("a gradient")), &flat(&golden[&key]));
+        assert!(error < 4e-6, "{key}: {error}");
+    }
+}
