@@ -40,3 +40,18 @@ pub fn split(joined: &[f32], widths: [usize; 2]) -> [Vec<f32>; 2] {
     }
     [a, b]
 }
+
+/// The rows of a matrix of `columns` columns, in the given order, as columns; by strips of 16, so that what is read and written stays
+/// in the cache.
+pub fn transpose(matrix: &[f32], columns: usize, order: &[usize]) -> Vec<f32> {
+    const STRIP: usize = 16;
+    let rows = order.len();
+    let mut out = vec![0.0; matrix.len()];
+    for (strip, out) in out.chunks_mut(STRIP * rows).enumerate() {
+        for (i, row) in order.iter().enumerate() {
+            let row = &matrix[row * columns..][strip * STRIP..columns.min((strip + 1) * STRIP)];
+            out[i..].iter_mut().step_by(rows).zip(row).for_each(|(out, value)| *out = *value);
+        }
+    }
+    out
+}
