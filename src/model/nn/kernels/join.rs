@@ -30,7 +30,7 @@ pub fn concat(a: &[f32], b: &[f32], widths: [usize; 2]) -> Vec<f32> {
     out
 }
 
-/// The reverse of [`concat`].
+/// The reverse of [`concat()`].
 pub fn split(joined: &[f32], widths: [usize; 2]) -> [Vec<f32>; 2] {
     let rows = joined.len() / (widths[0] + widths[1]);
     let (mut a, mut b) = (Vec::with_capacity(rows * widths[0]), Vec::with_capacity(rows * widths[1]));

@@ -190,6 +190,7 @@ fn portable(tile: &Tile, out: &mut [f32]) {
 }
 
 #[cfg(target_arch = "x86_64")]
+#[allow(clippy::needless_range_loop, reason = "tiles are addressed by row and lane")]
 mod x86 {
     use super::{LANE, Tile};
     use std::arch::x86_64::*;
