@@ -1,7 +1,14 @@
 //! What Ada-Diffuser is: tensors in, tensors out. No clock, no thread, no socket, no hidden randomness.
 pub mod agent;
 pub mod checkpoint;
+pub mod config;
+pub mod denoiser;
+pub mod diffusion;
+pub mod latent;
+mod networks;
 pub mod nn;
 pub mod noise;
 pub mod normalizer;
 pub mod trajectory;
+
+pub use networks::Networks;

@@ -1,213 +1,142 @@
-//! An agent: a trained model and the rules by which one episode turns observations into action chunks.
+//! An agent: a trained model and the rules by which one episode turns observations into action chunks (section 4.4 of the paper; algorithm 3).
+//!
+//! `act` is a function `(Episode, Observation) -> (Episode, Chunk)`. An act in progress is a [`Descent`]; each [`Agent::advance`] costs one
+//! denoiser forward, shared by all descents given to it, whatever rungs they stand on.
+mod advance;
+mod descent;
+mod episode;
+mod types;
 
-use crate::model::{normalizer::Normalizer, trajectory::Layout};
-use serde::{Deserialize, Serialize};
+pub use descent::Descent;
+pub use episode::Episode;
+pub use types::{AgentError, Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start};
 
-/// How a chunk is sampled; a checkpoint holds defaults chosen on validation episodes, a session may override them.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SamplerOptions {
-    /// Keep the partly denoised window between acts: one act then costs `sub_steps * action_horizon` network evaluations.
-    pub streaming: bool,
-    /// Actions returned by one act (T_a).
-    pub action_horizon: usize,
-    /// Sub-steps per rung of the ladder (n).
-    pub sub_steps: usize,
-    /// 0 is DDIM, 1 is DDPM.
-    pub eta: f32,
-    /// Factor on the standard deviation of all noise.
-    pub temperature: f32,
-    /// Trust region of the zig-zag refinement in nats: 0 is off, infinity (`null` in JSON) is as printed in the paper.
-    #[serde(with = "infinity_as_null")]
-    pub kappa: f32,
-    /// Whether latents are drawn or their means are used.
-    pub latent: LatentMode,
-}
-
-/// How a latent is taken from its Gaussian.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum LatentMode {
-    /// The mean: lower variance, the serving default.
-    Mean,
-    /// A draw, as the paper prints it.
-    Sample,
-}
-
-/// What a client must know of a model.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Spec {
-    /// Columns of states and actions.
-    pub layout: Layout,
-    /// Generated positions of the window (T).
-    pub plan_horizon: usize,
-    /// Real tokens the latent looks back on (T_x).
-    pub block_len: usize,
-    /// Real steps the denoiser itself sees (T_o); 1 is the current state alone.
-    pub obs_horizon: usize,
-    /// Width of the latent; 0 for a model without latents.
-    pub latent_dim: usize,
-    /// Number of diffusion levels (K).
-    pub level_max: usize,
-    /// Bounds of each action column, raw units.
-    pub action_low: Vec<f32>,
-    /// See `action_low`.
-    pub action_high: Vec<f32>,
-    /// Sampling defaults of the checkpoint.
-    pub sampler: SamplerOptions,
-    /// Whether the network was trained with the refinement that zig-zag does (a server refuses zig-zag otherwise).
-    pub refined: bool,
-    /// SHA-256 of the checkpoint's manifest, hex.
-    pub digest: String,
-}
-
-/// What the client saw since its last act, raw units.
-#[derive(Clone, Debug, PartialEq, Default)]
-pub struct Observation {
-    /// The current state s_tau.
-    pub state: Vec<f32>,
-    /// What was executed since the last act, oldest first; empty means: the chunk returned last was executed, nothing else is known.
-    pub executed: Vec<Executed>,
-}
-
-/// One executed step; what is missing is masked.
-#[derive(Clone, Debug, PartialEq, Default)]
-pub struct Executed {
-    /// The state in which it was executed; for the first one the last observation is known and used when this is missing.
-    pub state: Option<Vec<f32>>,
-    /// The action; missing: the one returned for this step.
-    pub action: Option<Vec<f32>>,
-    /// The reward that followed.
-    pub reward: Option<f32>,
-}
-
-/// The answer to one observation.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Chunk {
-    /// `(action_horizon, action_dim)`, raw units.
-    pub actions: Vec<Vec<f32>>,
-    /// Denoised estimate of the states of the window after the chunk's last action, `(plan_horizon, state_dim)`, raw units.
-    pub planned_states: Vec<Vec<f32>>,
-    /// Mean of the latent of the chunk's first step, `latent_dim` values.
-    pub latent_mean: Vec<f32>,
-    /// Its log-variance.
-    pub latent_log_var: Vec<f32>,
-    /// Predicted state after the chunk's last action, raw units.
-    pub predicted_state: Vec<f32>,
-    /// Denoiser evaluations spent.
-    pub evaluations: u32,
-    /// How the window started.
-    pub start: Start,
-}
-
-/// How the window of an act started.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Start {
-    /// From pure noise.
-    Cold,
-    /// From the window of the act before, as it was.
-    Warm,
-    /// From the window of the act before, noised again by this many rungs.
-    Renoised(u32),
-}
-
-/// Why an act failed; the episode is untouched in every case.
-#[derive(Debug, thiserror::Error)]
-pub enum AgentError {
-    /// The observation does not fit the model.
-    #[error("{field}: {reason}")]
-    InvalidObservation {
-        /// Path of the field, e.g. `executed[2].action`.
-        field: String,
-        /// What is wrong and what is expected.
-        reason: String,
-    },
-    /// The options do not fit the model.
-    #[error("options.{field}: {reason}")]
-    InvalidOptions {
-        /// The field of [`SamplerOptions`].
-        field: &'static str,
-        /// What is wrong and what is allowed.
-        reason: String,
-    },
-    /// The network answered with NaN or infinity.
-    #[error("the network's output is not finite")]
-    NonFinite,
-    /// A tensor operation failed: a defect of the model or the program.
-    #[error("tensor: {0}")]
-    Tensor(#[from] candle_core::Error),
-}
-
-/// JSON has no infinity: it is written as null.
-mod infinity_as_null {
-    use serde::{Deserialize, Deserializer, Serialize, Serializer};
-
-    pub fn serialize<S: Serializer>(value: &f32, serializer: S) -> Result<S::Ok, S::Error> {
-        value.is_finite().then_some(*value).serialize(serializer)
-    }
-
-    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
-        Ok(Option::<f32>::deserialize(deserializer)?.unwrap_or(f32::INFINITY))
-    }
-}
-
-/// One episode as a value: what it remembers of the past, and its partly denoised window.
-#[derive(Clone, Debug)]
-pub struct Episode {
-    seed: u64,
-}
-
-impl Episode {
-    /// Noise seed of the episode.
-    pub fn seed(&self) -> u64 {
-        self.seed
-    }
-    /// Latent mean and log-variance after the last act, if there was one.
-    pub fn latent(&self) -> Option<(&[f32], &[f32])> {
-        None
-    }
-    /// Resident size, for the session cap.
-    pub fn size_bytes(&self) -> usize {
-        0
-    }
-}
-
-/// An act in progress.
-#[derive(Debug)]
-pub struct Descent {}
-
-impl Descent {
-    /// Whether the chunk is ready to be taken by [`Agent::finish`].
-    pub fn is_done(&self) -> bool {
-        true
-    }
-}
+use crate::model::{Networks, config::ModelConfig, diffusion::ladder::Ladder, diffusion::process::Process};
 
 /// A loaded model.
 pub struct Agent {
+    config: ModelConfig,
+    networks: Networks,
+    process: Process,
     spec: Spec,
-    normalizer: Normalizer,
 }
 
 impl Agent {
+    /// An agent of these networks; `digest` identifies the checkpoint.
+    pub fn new(config: ModelConfig, networks: Networks, digest: String) -> Self {
+        let spec = Spec {
+            layout: config.layout,
+            plan_horizon: config.plan_horizon,
+            block_len: config.block_len,
+            obs_horizon: config.obs_horizon,
+            latent_dim: config.latent.as_ref().map_or(0, |latent| latent.dim),
+            level_max: config.level_max,
+            action_low: config.action_low.clone(),
+            action_high: config.action_high.clone(),
+            sampler: config.sampler.clone(),
+            refined: config.refined,
+            digest,
+        };
+        Self { process: Process::cosine(config.level_max), config, networks, spec }
+    }
+
     /// What a client must know of it.
     pub fn spec(&self) -> &Spec {
         &self.spec
     }
+
+    /// Architecture, units and defaults.
+    pub fn config(&self) -> &ModelConfig {
+        &self.config
+    }
+
+    /// The networks, for probes and held-out losses.
+    pub fn networks(&self) -> &Networks {
+        &self.networks
+    }
+
     /// A fresh episode.
+    ///
+    /// # Errors
+    /// [`AgentError::InvalidOptions`] if an option does not fit the model.
     pub fn open(&self, seed: u64, options: &SamplerOptions) -> Result<Episode, AgentError> {
-        unimplemented!("{seed} {options:?} {:?}", self.normalizer)
+        self.check_options(options)?;
+        Ok(Episode::new(seed, options.clone()))
     }
+
+    /// A new episode with the options of an old one. With `keep_history` the latent goes on looking back on the old one's last steps,
+    /// as a context that outlasts episodes needs.
+    pub fn reset(&self, episode: &Episode, seed: u64, keep_history: bool) -> Episode {
+        episode.reset(seed, keep_history)
+    }
+
     /// Checks the observation and starts an act on a copy of the episode; no network evaluation yet.
+    ///
+    /// # Errors
+    /// [`AgentError::InvalidObservation`] naming the field.
     pub fn begin(&self, episode: &Episode, observation: &Observation) -> Result<Descent, AgentError> {
-        unimplemented!("{episode:?} {observation:?}")
+        let state = self.checked("state", &observation.state, self.config.layout.state_dim)?;
+        let mut episode = episode.clone();
+        let executed = self.executed_tokens(&episode, observation)?;
+        let aligned = executed.len() == episode.options.action_horizon;
+        episode.commit(executed, self.config.block_len.max(self.config.obs_horizon));
+        Ok(Descent::new(episode, self.config.normalizer.state.normalize(&state), aligned))
     }
-    /// One denoiser forward shared by all these descents, none of which is done; rows do not influence each other.
-    pub fn advance(&self, descents: &mut [Descent]) -> Result<(), AgentError> {
-        unimplemented!("{descents:?}")
-    }
+
     /// The new episode and the chunk of a descent that is done.
+    ///
+    /// # Errors
+    /// [`AgentError::NonFinite`] if the network gave NaN or infinity.
     pub fn finish(&self, descent: Descent) -> Result<(Episode, Chunk), AgentError> {
-        unimplemented!("{descent:?}")
+        descent.finish(&self.config)
+    }
+
+    /// A whole act on its own: begin, advance until done, finish.
+    ///
+    /// # Errors
+    /// As those three.
+    pub fn act(&self, episode: &Episode, observation: &Observation) -> Result<(Episode, Chunk), AgentError> {
+        let mut descents = [self.begin(episode, observation)?];
+        while !descents[0].is_done() {
+            self.advance(&mut descents)?;
+        }
+        let [descent] = descents;
+        self.finish(descent)
+    }
+
+    fn check_options(&self, options: &SamplerOptions) -> Result<(), AgentError> {
+        let horizon = self.config.plan_horizon;
+        let invalid = |field, reason: String| Err(AgentError::InvalidOptions { field, reason });
+        if !(1..=horizon).contains(&options.action_horizon) {
+            return invalid("action_horizon", format!("{} is outside 1..={horizon}", options.action_horizon));
+        }
+        if let Err(reason) = Ladder::new(horizon, options.sub_steps, self.config.level_max) {
+            return invalid("sub_steps", reason);
+        }
+        if !(0.0..=1.0).contains(&options.eta) {
+            return invalid("eta", format!("{} is outside 0..=1", options.eta));
+        }
+        if !(0.0..=10.0).contains(&options.temperature) {
+            return invalid("temperature", format!("{} is outside 0..=10", options.temperature));
+        }
+        if options.kappa.is_nan() || options.kappa < 0.0 {
+            return invalid("kappa", format!("{} is not 0 (off) or above", options.kappa));
+        }
+        if options.kappa > 0.0 && self.config.latent.is_some() && !self.config.refined {
+            return invalid("kappa", "this checkpoint was not trained with refinement, and zig-zag would harm it; only 0 is allowed".into());
+        }
+        Ok(())
+    }
+
+    /// Values of the right number, all finite.
+    fn checked(&self, field: &str, values: &[f32], len: usize) -> Result<Vec<f32>, AgentError> {
+        let invalid = |field: String, reason: String| Err(AgentError::InvalidObservation { field, reason });
+        if values.len() != len {
+            return invalid(field.into(), format!("has {} values, the model takes {len}", values.len()));
+        }
+        match values.iter().position(|value| !value.is_finite()) {
+            Some(index) => invalid(format!("{field}[{index}]"), format!("{} is not finite", values[index])),
+            None => Ok(values.to_vec()),
+        }
     }
 }

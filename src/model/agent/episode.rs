@@ -1,0 +1,128 @@
+//! What one episode remembers between acts.
+
+use super::{Agent, AgentError, Observation, SamplerOptions};
+use crate::model::{latent::PlainGaussian, trajectory::Token};
+use std::collections::VecDeque;
+
+/// One episode as a value: what it remembers of the past, and its partly denoised window. Cloned, never changed in place by an act that
+/// has not finished.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Episode {
+    pub(super) seed: u64,
+    pub(super) options: SamplerOptions,
+    /// Steps executed so far: the environment time of the next decision.
+    pub(super) time: u64,
+    /// The last real tokens, oldest first, normalized units.
+    pub(super) history: VecDeque<Token>,
+    /// What the last act saw and answered.
+    pub(super) planned: Option<Planned>,
+    /// The window on its way down, if the last act left one (streaming).
+    pub(super) window: Option<Window>,
+    /// Latent of the last chunk's first step.
+    pub(super) latent: Option<PlainGaussian>,
+}
+
+/// What the last act saw and answered, normalized units.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Planned {
+    pub(super) state: Vec<f32>,
+    pub(super) actions: Vec<Vec<f32>>,
+}
+
+/// A window at READY: position i at rung i + 1.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Window {
+    /// `T * D` values, normalized units.
+    pub(super) x: Vec<f32>,
+    /// The state it was built for.
+    pub(super) predicted_state: Vec<f32>,
+    /// Mean of the prior latent of position 0 at the last cold start.
+    pub(super) anchor: Vec<f32>,
+}
+
+impl Episode {
+    pub(super) fn new(seed: u64, options: SamplerOptions) -> Self {
+        Self { seed, options, time: 0, history: VecDeque::new(), planned: None, window: None, latent: None }
+    }
+
+    pub(super) fn reset(&self, seed: u64, keep_history: bool) -> Self {
+        let mut fresh = Self::new(seed, self.options.clone());
+        if keep_history {
+            fresh.history.clone_from(&self.history);
+        }
+        fresh
+    }
+
+    /// Appends executed tokens; keeps the last `keep`.
+    pub(super) fn commit(&mut self, executed: Vec<Token>, keep: usize) {
+        self.time += executed.len() as u64;
+        self.history.extend(executed);
+        let surplus = self.history.len().saturating_sub(keep);
+        self.history.drain(..surplus);
+    }
+
+    /// Noise seed of the episode.
+    pub fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    /// How its chunks are sampled.
+    pub fn options(&self) -> &SamplerOptions {
+        &self.options
+    }
+
+    /// Steps executed so far.
+    pub fn time(&self) -> u64 {
+        self.time
+    }
+
+    /// Latent mean and log-variance after the last act, if there was one and the model has latents.
+    pub fn latent(&self) -> Option<(&[f32], &[f32])> {
+        self.latent.as_ref().map(|latent| (latent.mean.as_slice(), latent.log_var.as_slice()))
+    }
+
+    /// Resident size in bytes, for the session cap.
+    pub fn size_bytes(&self) -> usize {
+        let floats = |values: Option<&Vec<f32>>| values.map_or(0, |values| values.capacity() * size_of::<f32>());
+        let token = |token: &Token| size_of::<Token>() + floats(token.state.as_ref()) + floats(token.action.as_ref());
+        let history: usize = self.history.iter().map(token).sum();
+        let planned = self.planned.as_ref();
+        let planned: usize = planned.map_or(0, |p| floats(Some(&p.state)) + p.actions.iter().map(|a| 24 + floats(Some(a))).sum::<usize>());
+        let window = self.window.as_ref().map_or(0, |w| [&w.x, &w.predicted_state, &w.anchor].map(|v| floats(Some(v))).iter().sum());
+        let latent = self.latent.as_ref().map_or(0, |latent| floats(Some(&latent.mean)) + floats(Some(&latent.log_var)));
+        size_of::<Self>() + history + planned + window + latent
+    }
+}
+
+impl Agent {
+    /// What was executed since the last act as tokens, normalized; see [`Observation::executed`] for what may be missing.
+    pub(super) fn executed_tokens(&self, episode: &Episode, observation: &Observation) -> Result<Vec<Token>, AgentError> {
+        let planned = episode.planned.as_ref();
+        if observation.executed.is_empty() {
+            let actions = planned.map_or(&[][..], |planned| &planned.actions);
+            let state = |j: usize| if j == 0 { planned.map(|planned| planned.state.clone()) } else { None };
+            let token = |(j, action): (usize, &Vec<f32>)| Token { state: state(j), action: Some(action.clone()), ..Token::default() };
+            return Ok(actions.iter().enumerate().map(token).collect());
+        }
+        let (layout, normalizer) = (self.config.layout, &self.config.normalizer);
+        let executed = observation.executed.iter().enumerate().map(|(j, step)| {
+            let field = |name: &str| format!("executed[{j}].{name}");
+            let state = match &step.state {
+                Some(state) => Some(normalizer.state.normalize(&self.checked(&field("state"), state, layout.state_dim)?)),
+                None if j == 0 => planned.map(|planned| planned.state.clone()),
+                None => None,
+            };
+            let action = match &step.action {
+                Some(action) => normalizer.action.normalize(&self.checked(&field("action"), action, layout.action_dim)?),
+                None => planned.and_then(|planned| planned.actions.get(j)).cloned().ok_or_else(|| AgentError::InvalidObservation {
+                    field: field("action"),
+                    reason: "is missing, and no action was returned for this step".into(),
+                })?,
+            };
+            let reward = step.reward.map(|reward| self.checked(&field("reward"), &[reward], 1)).transpose()?;
+            let reward = reward.map(|reward| normalizer.reward.normalize(&reward)[0]);
+            Ok(Token { state, action: Some(action), reward, noise: 0.0 })
+        });
+        executed.collect()
+    }
+}

@@ -1,0 +1,152 @@
+//! What goes into an agent and comes out of it: options, observations, chunks, errors.
+
+use crate::model::trajectory::Layout;
+use serde::{Deserialize, Serialize};
+
+/// How a chunk is sampled; a checkpoint holds defaults chosen on validation episodes, a session may override them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SamplerOptions {
+    /// Keep the partly denoised window between acts: one act then costs `sub_steps * action_horizon` network evaluations.
+    pub streaming: bool,
+    /// Actions returned by one act (T_a).
+    pub action_horizon: usize,
+    /// Sub-steps per rung of the ladder (n).
+    pub sub_steps: usize,
+    /// 0 is DDIM, 1 is DDPM.
+    pub eta: f32,
+    /// Factor on the standard deviation of all noise.
+    pub temperature: f32,
+    /// Trust region of the zig-zag refinement in nats: 0 is off, infinity (`null` in JSON) is as printed in the paper.
+    #[serde(with = "infinity_as_null")]
+    pub kappa: f32,
+    /// Whether latents are drawn or their means are used.
+    pub latent: LatentMode,
+}
+
+/// How a latent is taken from its Gaussian.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LatentMode {
+    /// The mean: lower variance, the serving default.
+    Mean,
+    /// A draw, as the paper prints it.
+    Sample,
+}
+
+/// What a client must know of a model.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Spec {
+    /// Columns of states and actions.
+    pub layout: Layout,
+    /// Generated positions of the window (T).
+    pub plan_horizon: usize,
+    /// Real tokens the latent looks back on (T_x).
+    pub block_len: usize,
+    /// Real steps the denoiser itself sees (T_o); 1 is the current state alone.
+    pub obs_horizon: usize,
+    /// Width of the latent; 0 for a model without latents.
+    pub latent_dim: usize,
+    /// Number of diffusion levels (K).
+    pub level_max: usize,
+    /// Bounds of each action column, raw units.
+    pub action_low: Vec<f32>,
+    /// See `action_low`.
+    pub action_high: Vec<f32>,
+    /// Sampling defaults of the checkpoint.
+    pub sampler: SamplerOptions,
+    /// Whether the network was trained with the refinement that zig-zag does (a server refuses zig-zag otherwise).
+    pub refined: bool,
+    /// SHA-256 of the checkpoint's manifest, hex.
+    pub digest: String,
+}
+
+/// What the client saw since its last act, raw units.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct Observation {
+    /// The current state s_tau.
+    pub state: Vec<f32>,
+    /// What was executed since the last act, oldest first; empty means: the chunk returned last was executed, nothing else is known.
+    pub executed: Vec<Executed>,
+}
+
+/// One executed step; what is missing is masked.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct Executed {
+    /// The state in which it was executed; for the first one the last observation is known and used when this is missing.
+    pub state: Option<Vec<f32>>,
+    /// The action; missing: the one returned for this step.
+    pub action: Option<Vec<f32>>,
+    /// The reward that followed.
+    pub reward: Option<f32>,
+}
+
+/// The answer to one observation.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Chunk {
+    /// `(action_horizon, action_dim)`, raw units.
+    pub actions: Vec<Vec<f32>>,
+    /// Denoised estimate of the states of the window after the chunk's last action, `(plan_horizon, state_dim)`, raw units.
+    pub planned_states: Vec<Vec<f32>>,
+    /// Mean of the latent of the chunk's first step, `latent_dim` values.
+    pub latent_mean: Vec<f32>,
+    /// Its log-variance.
+    pub latent_log_var: Vec<f32>,
+    /// Predicted state after the chunk's last action, raw units.
+    pub predicted_state: Vec<f32>,
+    /// Denoiser evaluations spent.
+    pub evaluations: u32,
+    /// How the window started.
+    pub start: Start,
+}
+
+/// How the window of an act started.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// From pure noise.
+    Cold,
+    /// From the window of the act before, as it was.
+    Warm,
+    /// From the window of the act before, noised again by this many rungs.
+    Renoised(u32),
+}
+
+/// Why an act failed; the episode is untouched in every case.
+#[derive(Debug, thiserror::Error)]
+pub enum AgentError {
+    /// The observation does not fit the model.
+    #[error("{field}: {reason}")]
+    InvalidObservation {
+        /// Path of the field, e.g. `executed[2].action`.
+        field: String,
+        /// What is wrong and what is expected.
+        reason: String,
+    },
+    /// The options do not fit the model.
+    #[error("options.{field}: {reason}")]
+    InvalidOptions {
+        /// The field of [`SamplerOptions`].
+        field: &'static str,
+        /// What is wrong and what is allowed.
+        reason: String,
+    },
+    /// The network answered with NaN or infinity.
+    #[error("the network's output is not finite")]
+    NonFinite,
+    /// A tensor operation failed: a defect of the model or the program.
+    #[error("tensor: {0}")]
+    Tensor(#[from] candle_core::Error),
+}
+
+/// JSON has no infinity: it is written as null.
+mod infinity_as_null {
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    pub fn serialize<S: Serializer>(value: &f32, serializer: S) -> Result<S::Ok, S::Error> {
+        value.is_finite().then_some(*value).serialize(serializer)
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
+        Ok(Option::<f32>::deserialize(deserializer)?.unwrap_or(f32::INFINITY))
+    }
+}

@@ -1,0 +1,72 @@
+//! What a model is, apart from its weights: the content of a checkpoint's `config.json`.
+
+use crate::model::{agent::SamplerOptions, denoiser::DenoiserConfig, latent::LatentConfig, normalizer::Normalizer, trajectory::Layout};
+use serde::{Deserialize, Serialize};
+
+/// Architecture, units and sampling defaults of one model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelConfig {
+    /// Columns of states and actions.
+    pub layout: Layout,
+    /// Generated positions of the window (T).
+    pub plan_horizon: usize,
+    /// Real tokens the latent looks back on (T_x).
+    pub block_len: usize,
+    /// Real steps the denoiser itself sees (T_o); 1 is the current state alone, which is always inpainted.
+    pub obs_horizon: usize,
+    /// Number of diffusion levels (K); must be at least `sub_steps * plan_horizon`.
+    pub level_max: usize,
+    /// The latent model; none for the plain diffusion baselines.
+    pub latent: Option<LatentConfig>,
+    /// The denoiser.
+    pub denoiser: DenoiserConfig,
+    /// Bound of denoised states, in standard deviations of the data.
+    pub state_clip: f32,
+    /// Bounds of each action column, raw units.
+    pub action_low: Vec<f32>,
+    /// See `action_low`.
+    pub action_high: Vec<f32>,
+    /// Units.
+    pub normalizer: Normalizer,
+    /// Whether stage 2 trained the refinement that zig-zag does (section 4.3 of the paper).
+    pub refined: bool,
+    /// Root mean square spread of the prior's latent mean over the training data (all dimensions pooled): the yardstick of a latent jump.
+    pub latent_spread: f32,
+    /// When a streaming window is not trusted any more.
+    #[serde(default)]
+    pub restart: Restart,
+    /// Sampling defaults.
+    pub sampler: SamplerOptions,
+}
+
+/// When a stored window is noised again or thrown away. Distances of states are root mean squares in standard deviations of the data.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Restart {
+    /// From this distance between the real and the predicted state on, the window is noised again by a quarter of its rungs.
+    pub renoise_distance: f32,
+    /// From this distance on, it starts cold.
+    pub cold_distance: f32,
+    /// It starts cold when the latent of position 0 has moved by more than this many `latent_spread`s since the last cold start.
+    pub latent_jump: f32,
+}
+
+impl Default for Restart {
+    fn default() -> Self {
+        Self { renoise_distance: 0.5, cold_distance: 1.5, latent_jump: 1.0 }
+    }
+}
+
+impl ModelConfig {
+    /// Bounds a denoised token in place, normalized units: states by `state_clip`, actions by their bounds.
+    pub fn clip(&self, token: &mut [f32]) {
+        let (state, action) = token.split_at_mut(self.layout.state_dim);
+        state.iter_mut().for_each(|value| *value = value.clamp(-self.state_clip, self.state_clip));
+        let affine = &self.normalizer.action;
+        for (j, value) in action.iter_mut().enumerate() {
+            let bound = |raw: f32| (raw - affine.mean[j]) / affine.std[j];
+            *value = value.clamp(bound(self.action_low[j]), bound(self.action_high[j]));
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! The denoiser epsilon_theta; it predicts x0 (section 4.3 and appendix A.5 of the paper; x0 rather than eps because the losses that
+//! touch the latents are x0 losses, and a rung of the ladder spans many levels).
+mod dit;
+mod unet;
+
+use crate::model::{
+    config::ModelConfig,
+    nn::{
+        Linear,
+        params::Params,
+        silu,
+        time_embedding::sinusoid,
+    },
+};
+use candle_core::{D, Result, Tensor};
+use dit::Dit;
+use serde::{Deserialize, Serialize};
+use unet::Unet;
+
+/// Channels of the sinusoidal embedding of a position's level.
+const LEVEL_CHANNELS: usize = 16;
+/// Hidden width of the embedding of real steps.
+const OBSERVED_HIDDEN: usize = 128;
+
+/// Which backbone, and its sizes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum DenoiserConfig {
+    /// Temporal U-Net (Janner et al. 2022) with a linear skip from input to output; `plan_horizon` must be divisible by
+    /// `2^(widths - 1)`.
+    Unet {
+        /// Channels of each depth.
+        widths: Vec<usize>,
+    },
+    /// Diffusion transformer (Peebles and Xie 2023), conditioned token by token, with the same skip. Keeps the absolute scale of states
+    /// that group norm over time removes, so it suits states far from the origin.
+    Dit {
+        /// Width of a token.
+        width: usize,
+        /// Number of blocks.
+        depth: usize,
+        /// Attention heads.
+        heads: usize,
+    },
+}
+
+/// What the denoiser knows beside the noisy window.
+pub struct Condition<'a> {
+    /// `(B, T)` level of each position, 0 ..= level_max.
+    pub levels: &'a Tensor,
+    /// `(B, T, latent_dim)`, for models with latents.
+    pub latents: Option<&'a Tensor>,
+    /// `(B, (T_o - 1) * (state_dim + action_dim))` real steps, for models with `obs_horizon > 1`.
+    pub observed: Option<&'a Tensor>,
+}
+
+enum Backbone {
+    Unet(Unet),
+    Dit(Dit),
+}
+
+/// What a backbone is given: the input channels of each position, their levels, and a vector for the whole window.
+struct Inputs<'a> {
+    /// `(B, T, d_in)`: window, latents, level embedding side by side.
+    x: &'a Tensor,
+    /// `(B, T)`.
+    levels: &'a Tensor,
+    /// `(B, emb)` embedding of the real steps.
+    observed: Option<Tensor>,
+}
+
+/// The denoiser of a model.
+pub struct Denoiser {
+    backbone: Backbone,
+    input_skip: Linear,
+    observed: Option<[Linear; 2]>,
+}
+
+impl Denoiser {
+    /// Networks under `params`' scope.
+    ///
+    /// # Errors
+    /// If a loaded parameter is missing or of another shape.
+    pub fn new(config: &ModelConfig, params: &Params) -> Result<Self> {
+        let d_out = config.layout.dim();
+        let d_in = d_out + config.latent.as_ref().map_or(0, |latent| latent.dim) + LEVEL_CHANNELS;
+        let (backbone, emb) = match &config.denoiser {
+            DenoiserConfig::Unet { widths } => (Backbone::Unet(Unet::new(d_in, d_out, widths, params)?), unet::EMB),
+            DenoiserConfig::Dit { width, depth, heads } => {
+                (Backbone::Dit(Dit::new([d_in, d_out], *width, [*depth, *heads], params)?), *width)
+            }
+        };
+        let observed = match config.obs_horizon {
+            0 | 1 => None,
+            steps => Some([
+                Linear::new((steps - 1) * d_out, OBSERVED_HIDDEN, &params.scope("observed.0"))?,
+                Linear::new(OBSERVED_HIDDEN, emb, &params.scope("observed.2"))?,
+            ]),
+        };
+        Ok(Self { backbone, input_skip: Linear::new(d_in, d_out, &params.scope("input_skip"))?, observed })
+    }
+
+    /// Estimate of the clean window, `(B, T, D)` to `(B, T, D)`. Row b depends on row b of the inputs alone.
+    ///
+    /// # Errors
+    /// If a shape differs from the configuration, or a condition the network was built with is missing.
+    pub fn predict(&self, x: &Tensor, condition: &Condition) -> Result<Tensor> {
+        let embedded = sinusoid(condition.levels, LEVEL_CHANNELS)?;
+        let x = match condition.latents {
+            Some(latents) => Tensor::cat(&[x, latents, &embedded], D::Minus1)?,
+            None => Tensor::cat(&[x, &embedded], D::Minus1)?,
+        };
+        let inputs = Inputs { x: &x, levels: condition.levels, observed: self.embed_observed(condition.observed)? };
+        let out = match &self.backbone {
+            Backbone::Unet(net) => net.forward(&inputs)?,
+            Backbone::Dit(net) => net.forward(&inputs)?,
+        };
+        out + self.input_skip.forward(&x)?
+    }
+
+    fn embed_observed(&self, observed: Option<&Tensor>) -> Result<Option<Tensor>> {
+        match (&self.observed, observed) {
+            (Some([first, second]), Some(steps)) => Ok(Some(second.forward(&silu(&first.forward(steps)?)?)?)),
+            (Some(_), None) => candle_core::bail!("this denoiser needs the real steps before the window (obs_horizon > 1)"),
+            (None, _) => Ok(None),
+        }
+    }
+}

@@ -1,0 +1,108 @@
+//! The ladder: the table of noise levels a window walks down (section 4.1 of the paper, `k_i = i K / T`).
+//!
+//! Row m, position i sits at fine level `f_i(m) = clip(G + n i - m, 0, G)` with `G = n T`: positions fall one after the other, and at row
+//! `READY = n (T - 1)` the window is the paper's (k_1, ..., k_T). From there n rows take position 0 to clean; a window that then drops it
+//! and takes in a fresh position at pure noise is at READY again, so streaming and cold starts walk the same table.
+
+/// Levels of every position in every row.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ladder {
+    horizon: usize,
+    sub_steps: usize,
+    level_max: usize,
+}
+
+impl Ladder {
+    /// A ladder for `horizon` positions (T), `sub_steps` a rung (n), `level_max` levels (K).
+    ///
+    /// # Errors
+    /// A message if a size is zero or `level_max < sub_steps * horizon`, which would repeat levels.
+    pub fn new(horizon: usize, sub_steps: usize, level_max: usize) -> Result<Self, String> {
+        if horizon == 0 || sub_steps == 0 || level_max < sub_steps * horizon {
+            return Err(format!("needs 1 <= sub_steps * plan_horizon <= level_max, got {sub_steps} * {horizon} and {level_max}"));
+        }
+        Ok(Self { horizon, sub_steps, level_max })
+    }
+
+    /// Number of fine levels (G).
+    pub fn fine_max(&self) -> usize {
+        self.horizon * self.sub_steps
+    }
+
+    /// Row at which the window is (k_1, ..., k_T): position 0 is refined here.
+    pub fn ready(&self) -> usize {
+        self.sub_steps * (self.horizon - 1)
+    }
+
+    /// Row at which position 0 is clean.
+    pub fn emit(&self) -> usize {
+        self.sub_steps * self.horizon
+    }
+
+    /// Row at which the whole window is clean: `n (2 T - 1)` network evaluations from the top.
+    pub fn end(&self) -> usize {
+        self.sub_steps * (2 * self.horizon - 1)
+    }
+
+    /// Fine level of position `i` in row `m`.
+    pub fn fine(&self, m: usize, i: usize) -> usize {
+        (self.fine_max() + self.sub_steps * i).saturating_sub(m).min(self.fine_max())
+    }
+
+    /// Diffusion level of a fine level, 0 ..= level_max.
+    pub fn level(&self, fine: usize) -> usize {
+        let max = self.fine_max();
+        (2 * fine * self.level_max + max) / (2 * max)
+    }
+
+    /// Diffusion levels of row `m`, one a position.
+    pub fn row(&self, m: usize) -> Vec<usize> {
+        (0..self.horizon).map(|i| self.level(self.fine(m, i))).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn four_positions_one_sub_step() {
+        let ladder = Ladder::new(4, 1, 4).unwrap();
+        let rows: Vec<_> = (0..=ladder.end()).map(|m| ladder.row(m)).collect();
+        let expected = [[4, 4, 4, 4], [3, 4, 4, 4], [2, 3, 4, 4], [1, 2, 3, 4], [0, 1, 2, 3], [0, 0, 1, 2], [0, 0, 0, 1], [0, 0, 0, 0]];
+        assert_eq!(rows, expected.map(|row| row.to_vec()));
+        assert_eq!((ladder.ready(), ladder.emit()), (3, 4));
+    }
+
+    #[test]
+    fn too_few_levels_are_refused() {
+        assert!(Ladder::new(16, 2, 31).is_err());
+        assert!(Ladder::new(16, 2, 32).is_ok());
+    }
+
+    proptest! {
+        /// Levels never rise on the way down, never fall along the window, and after READY one position comes clean every n rows.
+        #[test]
+        fn monotone(horizon in 1_usize..20, sub_steps in 1_usize..5, extra in 0_usize..100) {
+            let ladder = Ladder::new(horizon, sub_steps, horizon * sub_steps + extra).unwrap();
+            let clean = |m| ladder.row(m).iter().filter(|level| **level == 0).count();
+            for m in 0..ladder.end() {
+                let (now, next) = (ladder.row(m), ladder.row(m + 1));
+                prop_assert!(now.iter().zip(&next).all(|(a, b)| a >= b));
+                prop_assert!(now.windows(2).all(|pair| pair[0] <= pair[1]));
+                prop_assert_eq!(clean(m), m.saturating_sub(ladder.ready()) / sub_steps);
+            }
+            prop_assert_eq!(clean(ladder.end()), horizon);
+        }
+
+        /// A window at `emit`, shifted by one with a fresh position at the top, is at READY: the streaming invariant.
+        #[test]
+        fn shift_is_ready(horizon in 1_usize..20, sub_steps in 1_usize..5) {
+            let ladder = Ladder::new(horizon, sub_steps, 3 * horizon * sub_steps).unwrap();
+            let mut shifted = ladder.row(ladder.emit()).split_off(1);
+            shifted.push(ladder.level_max);
+            prop_assert_eq!(shifted, ladder.row(ladder.ready()));
+        }
+    }
+}

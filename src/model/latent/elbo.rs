@@ -1,0 +1,103 @@
+//! The loss of stage 1: evidence lower bound over a block (equation of section 4.2; appendix A.4).
+
+use super::{Gaussian, LatentModel};
+use crate::model::trajectory::Tokens;
+use candle_core::{Result, Tensor};
+
+/// One batch of blocks.
+pub struct ElboBatch {
+    /// `(B, L)` real tokens; positions before an episode's start are wholly absent.
+    pub tokens: Tokens,
+    /// `(B, L - 1)`: 1 where both position t and t + 1 are real.
+    pub valid: Tensor,
+    /// `(B, L - 1, 3)`: which parts of the successor x_{t+1} the posterior of c_t may see; the state always, action and reward now and then,
+    /// so that one network serves the filter (state alone) and the refinement (state and action).
+    pub successor_present: Tensor,
+    /// `(B, L - 1, dim)` Gaussian draws of the latents.
+    pub eps: Tensor,
+}
+
+/// Settings of the loss.
+#[derive(Clone, Debug)]
+pub struct ElboOptions {
+    /// Weight of the KL term.
+    pub kl_weight: f64,
+    /// Standard deviation of the state change in normalized units, `state_dim` values.
+    pub state_change_std: Vec<f32>,
+    /// Weight of the reward against one state column.
+    pub reward_weight: f64,
+}
+
+/// Scalars of one evaluation.
+pub struct ElboTerms {
+    /// What is minimised.
+    pub loss: Tensor,
+    /// Mean squared residual of states, in units of the state change's variance.
+    pub state_error: Tensor,
+    /// Mean squared residual of rewards, normalized units.
+    pub reward_error: Tensor,
+    /// KL(q || p), summed over latent dimensions, mean over positions.
+    pub kl: Tensor,
+}
+
+impl LatentModel {
+    /// Posteriors q(c_t) for t = 0 .. L-2, from the GRU state after x_t and a throw-away step on what is seen of x_{t+1}:
+    /// Gaussians of `(B, L - 1, dim)`.
+    ///
+    /// # Errors
+    /// If widths differ.
+    pub fn posteriors(&self, tokens: &Tokens, successor_present: &Tensor) -> Result<Gaussian> {
+        let (batch, len) = tokens.batch_len()?;
+        let states = self.encoder.states(&tokens.narrow(0, len - 1)?, None)?;
+        let mut successors = tokens.narrow(1, len - 1)?;
+        successors.present = successors.present.mul(successor_present)?;
+        let rows = batch * (len - 1);
+        let flat = |t: &Tensor| t.reshape((rows, 1, ()));
+        let successors = Tokens {
+            state: flat(&successors.state)?,
+            action: flat(&successors.action)?,
+            reward: flat(&successors.reward)?,
+            present: flat(&successors.present)?,
+            noise: flat(&successors.noise)?,
+        };
+        let after = self.encoder.states(&successors, Some(&states.reshape((rows, ()))?))?;
+        self.encoder.posterior(&after.reshape((batch, len - 1, ()))?)
+    }
+
+    /// The negative ELBO of a batch. The prior of c_t sees the posterior of c_{t-1} with its gradient (stage 1 keeps it); the first position
+    /// has no predecessor in the block and only trains the decoder.
+    ///
+    /// Residuals of each column are divided by their own detached mean square: the gradient is that of a Gaussian likelihood with fitted
+    /// variance. With a plain squared error (the paper) a weak but identifying column drowns in the strong ones.
+    ///
+    /// # Errors
+    /// If shapes differ.
+    pub fn elbo(&self, batch: &ElboBatch, options: &ElboOptions) -> Result<ElboTerms> {
+        let (_, len) = batch.tokens.batch_len()?;
+        let q = self.posteriors(&batch.tokens, &batch.successor_present)?;
+        let latent = q.sample(&batch.eps)?;
+        let (now, next) = (batch.tokens.narrow(0, len - 1)?, batch.tokens.narrow(1, len - 1)?);
+        let (change, reward) = self.decoder.predict(&now.state, &now.action, &latent)?;
+        let std = Tensor::new(options.state_change_std.as_slice(), change.device())?;
+        let target = (&next.state - &now.state)?.broadcast_div(&std)?;
+        let count = batch.valid.sum_all()?;
+        let column_error = |residual: Tensor| -> Result<Tensor> {
+            residual.sqr()?.broadcast_mul(&batch.valid.unsqueeze(2)?)?.sum((0, 1))?.broadcast_div(&count)
+        };
+        let (state_error, reward_error) = (column_error((change - target)?)?, column_error((reward - &now.reward)?)?);
+        let log_error = |error: &Tensor| (error + 1e-6)?.log()?.sum_all();
+        let columns = state_error.dim(0)? as f64;
+        let rec = ((log_error(&state_error)? + log_error(&reward_error)?.affine(options.reward_weight, 0.0)?)?.affine(0.5 / columns, 0.0))?;
+        let kl = self.block_kl(&q, &batch.valid)?;
+        let loss = (rec + kl.affine(options.kl_weight / columns, 0.0)?)?;
+        Ok(ElboTerms { loss, state_error: state_error.mean_all()?, reward_error: reward_error.mean_all()?, kl })
+    }
+
+    fn block_kl(&self, q: &Gaussian, valid: &Tensor) -> Result<Tensor> {
+        let steps = q.mean.dim(1)?;
+        let prior = self.prior.predict(&q.narrow(0, steps - 1)?)?;
+        let valid = valid.narrow(1, 1, steps - 1)?;
+        let kl = (q.narrow(1, steps - 1)?.kl(&prior)? * &valid)?.sum_all()?;
+        kl / valid.sum_all()?
+    }
+}

@@ -1,0 +1,40 @@
+//! Element by element: activations and their derivatives.
+
+use super::{math, per_isa};
+
+/// A non-linearity.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Activation {
+    /// `x tanh(softplus(x))`.
+    Mish,
+    /// `x sigmoid(x)`.
+    Silu,
+    /// GELU by its hyperbolic tangent.
+    GeluTanh,
+    /// `max(x, 0)`.
+    Relu,
+}
+
+per_isa! {
+    /// `out[i] = f(x[i])`.
+    pub fn forward(kind: Activation, x: &[f32], out: &mut [f32]) {
+        match kind {
+            Activation::Mish => out.iter_mut().zip(x).for_each(|(out, &x)| *out = math::mish(x)),
+            Activation::Silu => out.iter_mut().zip(x).for_each(|(out, &x)| *out = math::silu(x)),
+            Activation::GeluTanh => out.iter_mut().zip(x).for_each(|(out, &x)| *out = math::gelu(x)),
+            Activation::Relu => out.iter_mut().zip(x).for_each(|(out, &x)| *out = if x < 0.0 { 0.0 } else { x }),
+        }
+    }
+}
+
+per_isa! {
+    /// `grad[i] *= f'(x[i])`: the gradient to the result becomes the gradient to the argument.
+    pub fn backward(kind: Activation, x: &[f32], grad: &mut [f32]) {
+        match kind {
+            Activation::Mish => grad.iter_mut().zip(x).for_each(|(grad, &x)| *grad *= math::mish_derivative(x)),
+            Activation::Silu => grad.iter_mut().zip(x).for_each(|(grad, &x)| *grad *= math::silu_derivative(x)),
+            Activation::GeluTanh => grad.iter_mut().zip(x).for_each(|(grad, &x)| *grad *= math::gelu_derivative(x)),
+            Activation::Relu => grad.iter_mut().zip(x).for_each(|(grad, &x)| *grad = if x > 0.0 { *grad } else { 0.0 }),
+        }
+    }
+}

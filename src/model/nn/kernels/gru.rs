@@ -1,0 +1,151 @@
+//! The gated recurrent unit over a whole sequence, and back through time (PyTorch's form, gates in the order r, z, n):
+//! `r = s(xr + hr)`, `z = s(xz + hz)`, `n = tanh(xn + r hn)`, `h' = (1 - z) n + z h`, where `x*` are the projected inputs (with
+//! their bias) and `h*` the projected state (with its).
+
+use super::{
+    convolution::every,
+    join, math, per_isa,
+    product::{Packed, Rows, Start, product},
+};
+
+/// Sizes of a GRU at work.
+#[derive(Clone, Copy, Debug)]
+pub struct Gru {
+    /// Sequences.
+    pub batch: usize,
+    /// Steps.
+    pub steps: usize,
+    /// Size of the state.
+    pub hidden: usize,
+}
+
+/// What backward gives.
+pub struct GruGrads {
+    /// To the projected inputs, `(batch, steps, 3 hidden)`.
+    pub inputs: Vec<f32>,
+    /// To the initial state, `(batch, hidden)`.
+    pub initial: Vec<f32>,
+    /// To the recurrent weights, `(3 hidden, hidden)`.
+    pub weight: Vec<f32>,
+    /// To the recurrent bias, `(3 hidden)`.
+    pub bias: Vec<f32>,
+}
+
+per_isa! {
+    /// The next state of one sequence from its projected input `x` and state `p` (3 hidden each) and its state `h`.
+    fn step(x: &[f32], p: &[f32], h: &[f32], out: &mut [f32]) {
+        let size = h.len();
+        let ((xr, xz, xn), (pr, pz, pn)) = (thirds(x, size), thirds(p, size));
+        for i in 0..out.len().min(size) {
+            let (r, z) = (math::sigmoid(xr[i] + pr[i]), math::sigmoid(xz[i] + pz[i]));
+            let n = math::tanh(r.mul_add(pn[i], xn[i]));
+            out[i] = z.mul_add(h[i] - n, n);
+        }
+    }
+}
+
+/// The three gates' parts of a row.
+#[inline(always)]
+fn thirds(row: &[f32], size: usize) -> (&[f32], &[f32], &[f32]) {
+    (&row[..size], &row[size..2 * size], &row[2 * size..3 * size])
+}
+
+/// One step of one sequence on the way back.
+struct StepBack<'a> {
+    /// Projected input.
+    x: &'a [f32],
+    /// Projected state; becomes its gradient.
+    p: &'a mut [f32],
+    /// State before the step.
+    h: &'a [f32],
+    /// Gradient to the projected input: result.
+    dx: &'a mut [f32],
+    /// Gradient to the state after the step; becomes the direct part of the gradient to the state before.
+    dh: &'a mut [f32],
+}
+
+per_isa! {
+    /// Back through the gates of one step.
+    fn step_back(at: StepBack) {
+        let size = at.h.len();
+        let (xr, xz, xn) = thirds(at.x, size);
+        let (pr, rest) = at.p.split_at_mut(size);
+        let (pz, pn) = rest.split_at_mut(size);
+        let (dr, rest) = at.dx.split_at_mut(size);
+        let (dz, dn) = rest.split_at_mut(size);
+        let (pn, dn, dh) = (&mut pn[..size], &mut dn[..size], &mut at.dh[..size]);
+        for i in 0..size {
+            let (r, z) = (math::sigmoid(xr[i] + pr[i]), math::sigmoid(xz[i] + pz[i]));
+            let n = math::tanh(r.mul_add(pn[i], xn[i]));
+            dn[i] = dh[i] * (1.0 - z) * (1.0 - n * n);
+            dz[i] = dh[i] * (at.h[i] - n) * z * (1.0 - z);
+            dr[i] = dn[i] * pn[i] * r * (1.0 - r);
+            pr[i] = dr[i];
+            pz[i] = dz[i];
+            pn[i] = dn[i] * r;
+            dh[i] *= z;
+        }
+    }
+}
+
+impl Gru {
+    /// All states, `(batch, steps, hidden)`, from projected inputs `x` `(batch, steps, 3 hidden)` and initial states `(batch, hidden)`.
+    /// `weight` is the recurrent weight packed transposed, `(hidden, 3 hidden)`.
+    pub fn forward(&self, x: &[f32], initial: &[f32], weight: &Packed, bias: &[f32]) -> Vec<f32> {
+        let (size, row) = (self.hidden, 3 * self.hidden);
+        let mut out = vec![0.0; self.batch * self.steps * size];
+        let (mut state, mut projected) = (initial.to_vec(), vec![0.0; self.batch * row]);
+        let (row_offset, k_offset) = (every(size, self.batch), every(1, size));
+        for t in 0..self.steps {
+            let rows = Rows { values: &state, row_offset: &row_offset, k_offset: &k_offset };
+            product(rows, weight, Start::Bias(bias), &mut projected, row);
+            for b in 0..self.batch {
+                let at = b * self.steps + t;
+                let next = &mut out[at * size..][..size];
+                step(&x[at * row..][..row], &projected[b * row..][..row], &state[b * size..][..size], next);
+                state[b * size..][..size].copy_from_slice(next);
+            }
+        }
+        out
+    }
+
+    /// The state before each step, `(batch, steps, hidden)`.
+    fn states_before(&self, initial: &[f32], states: &[f32]) -> Vec<f32> {
+        let mut before = Vec::with_capacity(states.len());
+        for (initial, states) in initial.chunks_exact(self.hidden).zip(states.chunks_exact(self.steps * self.hidden)) {
+            before.extend_from_slice(initial);
+            before.extend_from_slice(&states[..states.len() - self.hidden]);
+        }
+        before
+    }
+
+    /// Gradients from `grad`, the gradient to [`Self::forward`]'s result `states`; `recurrent` is (weight `(3 hidden, hidden)`, bias).
+    pub fn backward(&self, x: &[f32], initial: &[f32], recurrent: (&[f32], &[f32]), states: &[f32], grad: &[f32]) -> GruGrads {
+        let (size, row, count) = (self.hidden, 3 * self.hidden, self.batch * self.steps);
+        let before = self.states_before(initial, states);
+        let mut projected = vec![0.0; count * row];
+        let forward = Packed::new(recurrent.0, &every(1, size), row, size);
+        let (rows, k_offset) = (every(size, count), every(1, size));
+        product(Rows { values: &before, row_offset: &rows, k_offset: &k_offset }, &forward, Start::Bias(recurrent.1), &mut projected, row);
+        let back = Packed::new(recurrent.0, &every(size, row), size, 1);
+        let (mut inputs, mut dh) = (vec![0.0; count * row], vec![0.0; self.batch * size]);
+        for t in (0..self.steps).rev() {
+            for b in 0..self.batch {
+                let at = b * self.steps + t;
+                let dh = &mut dh[b * size..][..size];
+                dh.iter_mut().zip(&grad[at * size..][..size]).for_each(|(dh, grad)| *dh += grad);
+                let (p, dx) = (&mut projected[at * row..][..row], &mut inputs[at * row..][..row]);
+                step_back(StepBack { x: &x[at * row..][..row], p, h: &before[at * size..][..size], dx, dh });
+            }
+            let row_offset: Vec<usize> = (0..self.batch).map(|b| (b * self.steps + t) * row).collect();
+            let rows = Rows { values: &projected, row_offset: &row_offset, k_offset: &every(1, row) };
+            product(rows, &back, Start::Out, &mut dh, size);
+        }
+        let mut weight = vec![0.0; row * size];
+        let rows = Rows { values: &projected, row_offset: &every(1, row), k_offset: &every(row, count) };
+        product(rows, &Packed::new(&before, &every(size, count), size, 1), Start::Zero, &mut weight, size);
+        let mut bias = vec![0.0; row];
+        join::add_rows(&projected, row, &mut bias);
+        GruGrads { inputs, initial: dh, weight, bias }
+    }
+}

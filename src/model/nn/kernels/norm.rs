@@ -1,0 +1,164 @@
+//! Normalisation to mean 0 and variance 1, then scale and shift, then (optionally) Mish.
+//!
+//! One kernel for two layers: group norm with Mish takes its statistics over (channels in the group x time) of an item, layer norm
+//! is the case of one step and one group.
+
+use super::{math, per_isa};
+
+/// Which values share a mean and a variance, and what follows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Norm {
+    /// Time steps of an item; statistics run over all of them.
+    pub steps: usize,
+    /// Channels of a step.
+    pub channels: usize,
+    /// Groups that the channels are split in.
+    pub groups: usize,
+    /// Added to the variance.
+    pub eps: f32,
+    /// Whether Mish follows.
+    pub mish: bool,
+}
+
+/// What backward gives.
+pub struct NormGrads {
+    /// Gradient to `x`.
+    pub x: Vec<f32>,
+    /// Gradient to the scale, by channel.
+    pub weight: Vec<f32>,
+    /// Gradient to the shift, by channel.
+    pub bias: Vec<f32>,
+}
+
+/// Scratch by channel: the group's mean and inverse standard deviation spread over its channels, and two sums.
+struct Scratch {
+    mean: Vec<f32>,
+    rstd: Vec<f32>,
+    first: Vec<f32>,
+    second: Vec<f32>,
+}
+
+impl Scratch {
+    fn new(channels: usize) -> Self {
+        let zeros = || vec![0.0; channels];
+        Self { mean: zeros(), rstd: zeros(), first: zeros(), second: zeros() }
+    }
+}
+
+/// The mean over each group of per-channel sums, spread over the group's channels of `out` after `finish`.
+#[inline(always)]
+fn fold_groups(norm: Norm, sums: &[f32], out: &mut [f32], finish: impl Fn(f32) -> f32) {
+    let width = norm.channels / norm.groups;
+    let inverse = 1.0 / (norm.steps * width) as f32;
+    for (sums, out) in sums.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
+        let value = finish(math::sum(width, |i| sums[i]) * inverse);
+        out.fill(value);
+    }
+}
+
+/// Two passes over an item `x` of `(steps, channels)`: means, then variances about them.
+#[inline(always)]
+fn statistics(norm: Norm, x: &[f32], scratch: &mut Scratch) {
+    let Scratch { mean, rstd, first, .. } = scratch;
+    first.fill(0.0);
+    for row in x.chunks_exact(norm.channels) {
+        first.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
+    }
+    fold_groups(norm, first, mean, |mean| mean);
+    first.fill(0.0);
+    for row in x.chunks_exact(norm.channels) {
+        for ((sum, x), mean) in first.iter_mut().zip(row).zip(&*mean) {
+            let deviation = x - mean;
+            *sum = deviation.mul_add(deviation, *sum);
+        }
+    }
+    fold_groups(norm, first, rstd, |variance| 1.0 / (variance + norm.eps).sqrt());
+}
+
+/// Applies `f(z)` to the normalised, scaled and shifted values of an item.
+#[inline(always)]
+fn apply(item: (&[f32], &mut [f32]), scratch: &Scratch, weight: &[f32], bias: &[f32], f: impl Fn(f32) -> f32) {
+    let channels = weight.len();
+    for (x, out) in item.0.chunks_exact(channels).zip(item.1.chunks_exact_mut(channels)) {
+        let columns = scratch.mean.iter().zip(&scratch.rstd).zip(weight.iter().zip(bias));
+        for ((out, x), ((mean, rstd), (weight, bias))) in out.iter_mut().zip(x).zip(columns) {
+            *out = f(((x - mean) * rstd).mul_add(*weight, *bias));
+        }
+    }
+}
+
+per_isa! {
+    /// Normalises items of `(steps, channels)` in `x` into `out`; `weight` and `bias` are by channel.
+    pub fn forward(norm: Norm, x: &[f32], weight: &[f32], bias: &[f32], out: &mut [f32]) {
+        let mut scratch = Scratch::new(norm.channels);
+        let size = norm.steps * norm.channels;
+        for item in x.chunks_exact(size).zip(out.chunks_exact_mut(size)) {
+            statistics(norm, item.0, &mut scratch);
+            if norm.mish {
+                apply(item, &scratch, weight, bias, math::mish);
+            } else {
+                apply(item, &scratch, weight, bias, |z| z);
+            }
+        }
+    }
+}
+
+/// Multiplies the gradient of an item by Mish's derivative at the values before it.
+#[inline(always)]
+fn through_mish(x: &[f32], dz: &mut [f32], scratch: &Scratch, weight: &[f32], bias: &[f32]) {
+    let channels = weight.len();
+    for (x, dz) in x.chunks_exact(channels).zip(dz.chunks_exact_mut(channels)) {
+        let columns = scratch.mean.iter().zip(&scratch.rstd).zip(weight.iter().zip(bias));
+        for ((dz, x), ((mean, rstd), (weight, bias))) in dz.iter_mut().zip(x).zip(columns) {
+            *dz *= math::mish_derivative(((x - mean) * rstd).mul_add(*weight, *bias));
+        }
+    }
+}
+
+/// From the gradient `dz` to the scaled values of an item to the gradient to `x`, in place. The item's sums of `dz` and
+/// `dz * normalised` are left in `scratch.first` and `scratch.second`.
+#[inline(always)]
+fn through_statistics(norm: Norm, x: &[f32], dz: &mut [f32], weight: &[f32], scratch: &mut Scratch) {
+    let Scratch { mean, rstd, first, second } = scratch;
+    let channels = norm.channels;
+    first.fill(0.0);
+    second.fill(0.0);
+    for (x, dz) in x.chunks_exact(channels).zip(dz.chunks_exact(channels)) {
+        let sums = first.iter_mut().zip(second.iter_mut());
+        for (((first, second), (mean, rstd)), (x, dz)) in sums.zip(mean.iter().zip(&*rstd)).zip(x.iter().zip(dz)) {
+            *first += dz;
+            *second = dz.mul_add((x - mean) * rstd, *second);
+        }
+    }
+    let (mut even, mut odd) = (vec![0.0; channels], vec![0.0; channels]);
+    for (out, sums) in [(&mut even, &*first), (&mut odd, &*second)] {
+        let weighted: Vec<f32> = sums.iter().zip(weight).map(|(sum, weight)| sum * weight).collect();
+        fold_groups(norm, &weighted, out, |mean| mean);
+    }
+    for (x, dz) in x.chunks_exact(channels).zip(dz.chunks_exact_mut(channels)) {
+        let columns = mean.iter().zip(&*rstd).zip(weight.iter().zip(even.iter().zip(&odd)));
+        for ((dz, x), ((mean, rstd), (weight, (even, odd)))) in dz.iter_mut().zip(x).zip(columns) {
+            let normalised = (x - mean) * rstd;
+            *dz = rstd * (-normalised).mul_add(*odd, dz.mul_add(*weight, -even));
+        }
+    }
+}
+
+per_isa! {
+    /// Gradients from `dy`, the gradient to [`forward`]'s result; `affine` is (weight, bias).
+    pub fn backward(norm: Norm, x: &[f32], affine: (&[f32], &[f32]), dy: &[f32]) -> NormGrads {
+        let mut grads = NormGrads { x: dy.to_vec(), weight: vec![0.0; norm.channels], bias: vec![0.0; norm.channels] };
+        let mut scratch = Scratch::new(norm.channels);
+        let size = norm.steps * norm.channels;
+        for (x, dz) in x.chunks_exact(size).zip(grads.x.chunks_exact_mut(size)) {
+            statistics(norm, x, &mut scratch);
+            if norm.mish {
+                through_mish(x, dz, &scratch, affine.0, affine.1);
+            }
+            through_statistics(norm, x, dz, affine.0, &mut scratch);
+            grads.bias.iter_mut().zip(&scratch.first).for_each(|(total, sum)| *total += sum);
+            grads.weight.iter_mut().zip(&scratch.second).for_each(|(total, sum)| *total += sum);
+        }
+        grads
+    }
+}
