@@ -1,7 +1,29 @@
 //! config.json + model.safetensors + manifest.json <-> [`Agent`]; the only file access of this room.
+//!
+//! safetensors itself accepts NaN, flipped bits and an 88 MB header, so everything is checked against the manifest, and the networks
+//! must ask for exactly the tensors that are there.
 
-use crate::model::agent::Agent;
-use std::path::Path;
+use crate::model::{Networks, agent::Agent, config::ModelConfig, nn::params::Params};
+use candle_core::{Device, Tensor};
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::{
+    collections::BTreeMap,
+    fs,
+    io::{Read, Write},
+    path::Path,
+};
+
+/// Version of the three files; a reader refuses others.
+pub const FORMAT_VERSION: u32 = 1;
+const CONFIG: &str = "config.json";
+const WEIGHTS: &str = "model.safetensors";
+const MANIFEST: &str = "manifest.json";
+/// Largest config, manifest and safetensors header, in bytes.
+const HEADER_BYTES_MAX: u64 = 1 << 20;
+/// Largest weight file, in bytes.
+const WEIGHT_BYTES_MAX: u64 = 1 << 30;
 
 /// Why a checkpoint was refused.
 #[derive(Debug, thiserror::Error)]
@@ -24,10 +46,184 @@ pub enum CheckpointError {
     },
 }
 
+/// Where a checkpoint comes from.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Provenance {
+    /// File name of the data set.
+    pub dataset: String,
+    /// SHA-256 of the data set's file, hex.
+    pub dataset_sha256: String,
+    /// The recipe as it was run, TOML.
+    pub recipe: String,
+    /// Training seed.
+    pub seed: u64,
+    /// What was measured while training.
+    pub metrics: serde_json::Value,
+}
+
+/// Content of `manifest.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// [`FORMAT_VERSION`].
+    pub format_version: u32,
+    /// SHA-256 of each file, hex.
+    pub files: BTreeMap<String, String>,
+    /// Shape and SHA-256 of each tensor.
+    pub tensors: BTreeMap<String, TensorDigest>,
+    /// Where it comes from.
+    pub provenance: Provenance,
+}
+
+/// One tensor in the manifest; all are f32.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TensorDigest {
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// SHA-256 of its little-endian bytes, hex.
+    pub sha256: String,
+}
+
+/// Writes a checkpoint: each file beside its place and renamed, the manifest last, so that a torn write is refused by the loader.
+///
+/// # Errors
+/// If a file cannot be written or a tensor is not f32.
+pub fn save(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>, provenance: &Provenance) -> Result<(), CheckpointError> {
+    fs::create_dir_all(dir).map_err(|source| io(dir, source))?;
+    let config = pretty(config, &dir.join(CONFIG))?;
+    let (weights, digests) = serialize_tensors(tensors).map_err(|reason| invalid(&dir.join(WEIGHTS), reason))?;
+    let files = [(CONFIG, &config), (WEIGHTS, &weights)].map(|(name, bytes)| (name.to_string(), sha256(bytes)));
+    let manifest = Manifest { format_version: FORMAT_VERSION, files: files.into(), tensors: digests, provenance: provenance.clone() };
+    let manifest = pretty(&manifest, &dir.join(MANIFEST))?;
+    [(CONFIG, config), (WEIGHTS, weights), (MANIFEST, manifest)].iter().try_for_each(|(name, bytes)| replace(&dir.join(name), bytes))
+}
+
 /// Reads, checks and builds the agent in this directory.
 ///
 /// # Errors
 /// If a file is missing, a digest differs, a tensor is missing, superfluous, of another shape, or not finite.
 pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
-    unimplemented!("{dir:?}")
+    let (manifest, digest) = load_manifest(dir)?;
+    let config: ModelConfig = parse(&dir.join(CONFIG), &read(&dir.join(CONFIG), HEADER_BYTES_MAX)?, &manifest)?;
+    let path = dir.join(WEIGHTS);
+    let weights = read(&path, WEIGHT_BYTES_MAX)?;
+    check_digest(&path, &weights, &manifest)?;
+    let tensors = read_tensors(&weights, &manifest).map_err(|reason| invalid(&path, reason))?;
+    let params = Params::loaded(tensors);
+    let networks = Networks::new(&config, &params).map_err(|error| invalid(&path, error.to_string()))?;
+    if let Some(name) = params.unused().first() {
+        return Err(invalid(&path, format!("tensor {name} belongs to no network of {CONFIG}")));
+    }
+    config.check().map_err(|reason| invalid(&dir.join(CONFIG), reason))?;
+    Ok(Agent::new(config, networks, digest))
+}
+
+/// The manifest of a checkpoint and its own SHA-256, which names the checkpoint.
+///
+/// # Errors
+/// If it is missing, no manifest, or of another format version.
+pub fn load_manifest(dir: &Path) -> Result<(Manifest, String), CheckpointError> {
+    let path = dir.join(MANIFEST);
+    let bytes = read(&path, HEADER_BYTES_MAX)?;
+    let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|error| invalid(&path, error.to_string()))?;
+    if manifest.format_version != FORMAT_VERSION {
+        return Err(invalid(&path, format!("format version {}, this program reads {FORMAT_VERSION}", manifest.format_version)));
+    }
+    Ok((manifest, sha256(&bytes)))
+}
+
+fn serialize_tensors(tensors: &BTreeMap<String, Tensor>) -> Result<(Vec<u8>, BTreeMap<String, TensorDigest>), String> {
+    let mut bytes: Vec<(String, Vec<usize>, Vec<u8>)> = Vec::new();
+    for (name, tensor) in tensors {
+        let values = tensor.flatten_all().and_then(|flat| flat.to_vec1::<f32>()).map_err(|error| format!("{name}: {error}"))?;
+        bytes.push((name.clone(), tensor.dims().to_vec(), values.iter().flat_map(|value| value.to_le_bytes()).collect()));
+    }
+    let digest = |(name, shape, bytes): &(String, Vec<usize>, Vec<u8>)| {
+        (name.clone(), TensorDigest { shape: shape.clone(), sha256: sha256(bytes) })
+    };
+    let digests = bytes.iter().map(digest).collect();
+    let views = bytes.iter().map(|(name, shape, bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)));
+    let views = views.collect::<Result<Vec<_>, safetensors::SafeTensorError>>().map_err(|error| error.to_string())?;
+    Ok((safetensors::serialize(views, None).map_err(|error| error.to_string())?, digests))
+}
+
+fn read_tensors(bytes: &[u8], manifest: &Manifest) -> Result<BTreeMap<String, Tensor>, String> {
+    let header = bytes.first_chunk::<8>().map(|length| u64::from_le_bytes(*length)).ok_or("shorter than a safetensors header")?;
+    if header > HEADER_BYTES_MAX {
+        return Err(format!("header of {header} bytes, at most {HEADER_BYTES_MAX} are read"));
+    }
+    let file = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
+    if let Some(name) = manifest.tensors.keys().find(|name| file.tensor(name).is_err()) {
+        return Err(format!("tensor {name} of the manifest is missing"));
+    }
+    let mut tensors = BTreeMap::new();
+    for (name, view) in file.tensors() {
+        let expected = manifest.tensors.get(&name).ok_or_else(|| format!("tensor {name} is not in the manifest"))?;
+        let found = TensorDigest { shape: view.shape().to_vec(), sha256: sha256(view.data()) };
+        if view.dtype() != Dtype::F32 || found != *expected {
+            return Err(format!("tensor {name} is {:?} {:?}, the manifest has F32 {:?} with another digest", view.dtype(), found.shape, expected.shape));
+        }
+        let values: Vec<f32> = view.data().chunks_exact(4).map(|four| f32::from_le_bytes([four[0], four[1], four[2], four[3]])).collect();
+        if values.iter().any(|value| !value.is_finite()) {
+            return Err(format!("tensor {name} holds NaN or infinity"));
+        }
+        tensors.insert(name, Tensor::from_vec(values, found.shape, &Device::Cpu).map_err(|error| error.to_string())?);
+    }
+    Ok(tensors)
+}
+
+fn parse<T: for<'de> Deserialize<'de>>(path: &Path, bytes: &[u8], manifest: &Manifest) -> Result<T, CheckpointError> {
+    check_digest(path, bytes, manifest)?;
+    serde_json::from_slice(bytes).map_err(|error| invalid(path, error.to_string()))
+}
+
+fn check_digest(path: &Path, bytes: &[u8], manifest: &Manifest) -> Result<(), CheckpointError> {
+    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    match manifest.files.get(name) {
+        Some(expected) if *expected == sha256(bytes) => Ok(()),
+        Some(_) => Err(invalid(path, format!("SHA-256 differs from {MANIFEST}"))),
+        None => Err(invalid(path, format!("is not in {MANIFEST}"))),
+    }
+}
+
+fn pretty<T: Serialize>(value: &T, path: &Path) -> Result<Vec<u8>, CheckpointError> {
+    let mut bytes = serde_json::to_vec_pretty(value).map_err(|error| invalid(path, error.to_string()))?;
+    bytes.push(b'\n');
+    Ok(bytes)
+}
+
+fn read(path: &Path, bytes_max: u64) -> Result<Vec<u8>, CheckpointError> {
+    let file = fs::File::open(path).map_err(|source| io(path, source))?;
+    let mut bytes = Vec::new();
+    file.take(bytes_max + 1).read_to_end(&mut bytes).map_err(|source| io(path, source))?;
+    if bytes.len() as u64 > bytes_max {
+        return Err(invalid(path, format!("larger than {bytes_max} bytes")));
+    }
+    Ok(bytes)
+}
+
+/// Writes beside the file, syncs, renames.
+fn replace(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+    let beside = path.with_extension("partial");
+    let write = || {
+        let mut file = fs::File::create(&beside)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&beside, path)
+    };
+    write().map_err(|source| io(path, source))
+}
+
+fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn io(path: &Path, source: std::io::Error) -> CheckpointError {
+    CheckpointError::Io { path: path.display().to_string(), source }
+}
+
+fn invalid(path: &Path, reason: impl Into<String>) -> CheckpointError {
+    CheckpointError::Invalid { path: path.display().to_string(), reason: reason.into() }
 }

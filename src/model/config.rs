@@ -59,6 +59,38 @@ impl Default for Restart {
 }
 
 impl ModelConfig {
+    /// Whether the sizes fit together; the networks check their own.
+    ///
+    /// # Errors
+    /// A message that names the field.
+    pub fn check(&self) -> Result<(), String> {
+        let (state, action) = (self.layout.state_dim, self.layout.action_dim);
+        let widths = [
+            ("normalizer.state", self.normalizer.state.dim(), state),
+            ("normalizer.state.std", self.normalizer.state.std.len(), state),
+            ("normalizer.state_change_std", self.normalizer.state_change_std.len(), state),
+            ("normalizer.action", self.normalizer.action.dim(), action),
+            ("normalizer.action.std", self.normalizer.action.std.len(), action),
+            ("normalizer.reward", self.normalizer.reward.dim(), 1),
+            ("action_low", self.action_low.len(), action),
+            ("action_high", self.action_high.len(), action),
+        ];
+        if let Some((field, found, expected)) = widths.iter().find(|(_, found, expected)| found != expected) {
+            return Err(format!("{field} has {found} columns, expected {expected}"));
+        }
+        let scales = [&self.normalizer.state, &self.normalizer.action, &self.normalizer.reward];
+        if scales.iter().any(|affine| affine.std.iter().any(|std| !std.is_normal())) {
+            return Err("normalizer: a scale is zero or not finite".into());
+        }
+        if self.action_low.iter().zip(&self.action_high).any(|(low, high)| low >= high || !low.is_finite() || !high.is_finite()) {
+            return Err("action_low must be below action_high".into());
+        }
+        if self.plan_horizon == 0 || self.obs_horizon == 0 || self.state_clip <= 0.0 {
+            return Err("plan_horizon, obs_horizon and state_clip must be positive".into());
+        }
+        Ok(())
+    }
+
     /// Bounds a denoised token in place, normalized units: states by `state_clip`, actions by their bounds.
     pub fn clip(&self, token: &mut [f32]) {
         let (state, action) = token.split_at_mut(self.layout.state_dim);

@@ -7,6 +7,9 @@ mod descent;
 mod episode;
 mod types;
 
+#[cfg(test)]
+mod tests;
+
 pub use descent::Descent;
 pub use episode::Episode;
 pub use types::{AgentError, Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start};

@@ -1,0 +1,98 @@
+"""Episodes on disk in D4RL's layout, and the data card beside them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+
+@dataclass
+class Episodes:
+    """Flat arrays, one row a step: the observation before it, the action executed in it, the reward it earned.
+
+    Attributes:
+        observations: (N, observation), float32.
+        actions: (N, action), float32, as executed (clipped, noise included).
+        rewards: (N,), float32.
+        terminals: (N,), bool; the task ended in this step.
+        timeouts: (N,), bool; the clock ended the episode in this step.
+        context: (N, context), float32; what was hidden while the action was executed.
+        action_noise: (N,), float32; standard deviation of the episode's action noise.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminals: np.ndarray
+    timeouts: np.ndarray
+    context: np.ndarray
+    action_noise: np.ndarray
+
+    def returns(self) -> np.ndarray:
+        """Undiscounted return of each episode, shape (episodes,), float64."""
+        ends = np.flatnonzero(self.terminals | self.timeouts)
+        starts = np.concatenate([[0], ends[:-1] + 1])
+        return np.add.reduceat(self.rewards.astype(np.float64), starts)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """D4RL path -> array."""
+        return {
+            "observations": self.observations,
+            "actions": self.actions,
+            "rewards": self.rewards,
+            "terminals": self.terminals,
+            "timeouts": self.timeouts,
+            "infos/context": self.context,
+            "infos/action_noise": self.action_noise,
+        }
+
+
+def save_episodes(episodes: Episodes, path: Path) -> str:
+    """Write beside and rename; returns the SHA-256 of the file. The same episodes give the same bytes."""
+    partial = path.with_name(f".{path.name}.partial")
+    with h5py.File(partial, "w", libver="earliest") as file:
+        for name, column in episodes.columns().items():
+            file.create_dataset(name, data=column, track_times=False)
+    digest = sha256(partial)
+    os.replace(partial, path)
+    return digest
+
+
+def load_episodes(path: Path) -> Episodes:
+    """Read what `save_episodes` wrote. Raises `KeyError` naming a missing column."""
+    with h5py.File(path, "r") as file:
+        names = {"context": "infos/context", "action_noise": "infos/action_noise"}
+        return Episodes(**{field: file[names.get(field, field)][()] for field in Episodes.__dataclass_fields__})
+
+
+def card_path(path: Path) -> Path:
+    """`X.h5` -> `X.card.json`."""
+    return path.with_name(f"{path.stem}.card.json")
+
+
+def save_card(card: dict[str, Any], path: Path) -> None:
+    """Write the data card of the data set at `path`, beside it."""
+    target = card_path(path)
+    partial = target.with_name(f".{target.name}.partial")
+    partial.write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+    os.replace(partial, target)
+
+
+def sha256(path: Path) -> str:
+    """Digest of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else _sha256(file)
+
+
+def _sha256(file: Any) -> str:
+    digest = hashlib.sha256()
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,204 @@
+"""The cheetah's tasks: a wind that it cannot feel, or a wanted speed that nobody tells it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from .half_cheetah import ACTION_SIZE, OBSERVATION_SIZE, HalfCheetahBody
+
+ACTION_COST = 0.05
+WIND_TARGET = 1.5
+"""Wanted speed of the wind tasks, m/s."""
+NOMINAL_STEPS = 200
+RENDER_SIZE = (480, 360)
+
+
+class CheetahTask(gym.Env[np.ndarray, np.ndarray]):
+    """What the cheetah tasks share: reward `-|v - v*| - .05 a.a`, episodes numbered within a session, rendering.
+
+    A *session* starts at the first `reset` and at each `reset(seed=...)`; its episodes are numbered 0, 1, ...
+    `reset(options={"episode": i})` jumps to episode `i`. The action is clipped to [-1, 1] before anything else.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own spelling)
+
+    def __init__(self, wind_on: str = "torso", render_mode: str | None = None) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be rgb_array or None, not {render_mode!r}")
+        self.body = HalfCheetahBody(wind_on)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+        self.render_mode = render_mode
+        self._renderer: Any = None
+        self._episode = -1
+        self._step = 0
+
+    @property
+    def context(self) -> np.ndarray:
+        """The hidden value that acts on the coming step, shape (1,)."""
+        return np.array([self._context()], np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; see the class for `seed` and `options`."""
+        super().reset(seed=seed)
+        starts_session = seed is not None or self._episode < 0
+        self._episode = 0 if starts_session else self._episode + 1
+        self._episode = int((options or {}).get("episode", self._episode))
+        self._step = 0
+        self._draw_context(starts_session)
+        self.body.reset(self.np_random)
+        return self.body.observation(), {"context": self.context, "x_position": self.body.x}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advance .05 s; see `gymnasium.Env.step`."""
+        action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        context = self.context
+        speed = self.body.step(action, self._wind())
+        reward = -abs(speed - self._target()) - ACTION_COST * float(action @ action)
+        self._step += 1
+        info = {"context": context, "x_position": self.body.x, "x_velocity": speed}
+        return self.body.observation(), reward, False, False, info
+
+    def failed(self, episode_return: float) -> bool:
+        """Whether a finished episode earned little more than standing still would have."""
+        return episode_return < -0.75 * NOMINAL_STEPS * self._target()
+
+    def render(self) -> np.ndarray | None:
+        """One frame (360, 480, 3) uint8 from the camera that tracks the cheetah; needs a working `MUJOCO_GL`."""
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            import mujoco
+
+            self._renderer = mujoco.Renderer(self.body.model, height=RENDER_SIZE[1], width=RENDER_SIZE[0])
+        self._renderer.update_scene(self.body.data, camera="track")
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Free the renderer, if one was made."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _draw_context(self, starts_session: bool) -> None:
+        raise NotImplementedError
+
+    def _context(self) -> float:
+        raise NotImplementedError
+
+    def _wind(self) -> float:
+        return 0.0
+
+    def _target(self) -> float:
+        return WIND_TARGET
+
+
+class _CheetahWind(CheetahTask):
+    """A head wind of `gain * (mean + swing sin(rate * clock + phi))` N; the context is that force."""
+
+    mean: float
+    swing: float
+    rate: float
+
+    def __init__(
+        self,
+        gain: float = 1.0,
+        phase: float | None = None,
+        wind_on: str = "torso",
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(wind_on, render_mode)
+        self.gain = gain
+        self.phase = phase
+        self._phi = 0.0
+
+    def _draw_phase(self) -> None:
+        drawn = self.np_random.uniform(0.0, 2.0 * math.pi)
+        self._phi = drawn if self.phase is None else self.phase
+
+    def _clock(self) -> int:
+        raise NotImplementedError
+
+    def _context(self) -> float:
+        return self.gain * (self.mean + self.swing * math.sin(self.rate * self._clock() + self._phi))
+
+    def _wind(self) -> float:
+        return self._context()
+
+
+class CheetahWindS(_CheetahWind):
+    """Wind `5 + 5 sin(.5 t + phi)` N in step `t`: 0 to 10 N, a period of 12.6 steps.
+
+    Args:
+        gain: factor on the force.
+        phase: `phi`, or None to draw it in each episode; 0 is the paper's wind.
+        wind_on: `torso` (default), `all_bodies` or `rootx`.
+        render_mode: `rgb_array` or None.
+    """
+
+    mean, swing, rate = 5.0, 5.0, 0.5
+
+    def _draw_context(self, starts_session: bool) -> None:
+        self._draw_phase()
+
+    def _clock(self) -> int:
+        return self._step
+
+
+class CheetahWindE(_CheetahWind):
+    """Wind `10 + 5 sin(.8 i + phi)` N throughout episode `i`: 5 to 15 N.
+
+    Args:
+        gain: factor on the force.
+        phase: `phi`, or None to draw it in each session; 0 is the paper's wind.
+        wind_on: `torso` (default), `all_bodies` or `rootx`.
+        render_mode: `rgb_array` or None.
+    """
+
+    mean, swing, rate = 10.0, 5.0, 0.8
+
+    def _draw_context(self, starts_session: bool) -> None:
+        if starts_session:
+            self._draw_phase()
+
+    def _clock(self) -> int:
+        return self._episode
+
+
+class CheetahVelE(CheetahTask):
+    """A wanted speed that is constant within an episode and shows only in the reward.
+
+    Args:
+        targets: the speeds to draw from, or `uniform` for U(0, 3), or `lilac` for 1.5 + 1.5 sin(.5 i) in episode `i`.
+        render_mode: `rgb_array` or None.
+    """
+
+    def __init__(self, targets: str | Sequence[float] = (1.0, 2.5), render_mode: str | None = None) -> None:
+        super().__init__(render_mode=render_mode)
+        if isinstance(targets, str):
+            if targets not in ("uniform", "lilac"):
+                raise ValueError(f"targets must be speeds, 'uniform' or 'lilac', not {targets!r}")
+        elif not targets:
+            raise ValueError("targets must name at least one speed")
+        self.targets = targets if isinstance(targets, str) else tuple(float(v) for v in targets)
+        self._speed = 0.0
+
+    def _draw_context(self, starts_session: bool) -> None:
+        if self.targets == "uniform":
+            self._speed = self.np_random.uniform(0.0, 3.0)
+        elif self.targets == "lilac":
+            self._speed = 1.5 + 1.5 * math.sin(0.5 * self._episode)
+        else:
+            self._speed = self.targets[self.np_random.integers(len(self.targets))]
+
+    def _context(self) -> float:
+        return self._speed
+
+    def _target(self) -> float:
+        return self._speed

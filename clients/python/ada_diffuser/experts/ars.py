@@ -1,0 +1,93 @@
+"""Augmented Random Search, version V2-t (Mania, Guy, Recht 2018, Algorithm 2), for linear policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from .policy import LinearPolicy
+
+STD_MIN = 1e-3
+
+
+@dataclass(frozen=True)
+class ArsSettings:
+    """The constants of the search.
+
+    Attributes:
+        iterations: updates of the policy; each costs `2 * directions` episodes.
+        directions: perturbations tried in an iteration, N in the paper.
+        top: of these, how many best ones the update uses, b.
+        step: step size, alpha.
+        noise: standard deviation of a perturbation, nu.
+    """
+
+    iterations: int = 250
+    directions: int = 8
+    top: int = 4
+    step: float = 0.02
+    noise: float = 0.03
+
+
+class RunningMoments:
+    """Mean and standard deviation of all states visited so far (Chan's parallel update)."""
+
+    def __init__(self, size: int) -> None:
+        self.count = 0
+        self.mean = np.zeros(size)
+        self._squares = np.zeros(size)
+
+    def add(self, states: np.ndarray) -> None:
+        """Take in states (n, size)."""
+        count, mean = len(states), states.mean(axis=0)
+        delta, total = mean - self.mean, self.count + count
+        self._squares += ((states - mean) ** 2).sum(axis=0) + delta**2 * self.count * count / total
+        self.mean = self.mean + delta * count / total
+        self.count = total
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviation, ones before the first state, never below a thousandth."""
+        if self.count == 0:
+            return np.ones_like(self.mean)
+        return np.maximum(np.sqrt(self._squares / self.count), STD_MIN)
+
+
+Rollout = Callable[[LinearPolicy, int], tuple[float, np.ndarray]]
+"""(policy, episode seed) -> (return, states visited (steps, features))."""
+
+
+def search(rollout: Rollout, shape: tuple[int, int], settings: ArsSettings, rng: np.random.Generator) -> Iterator[LinearPolicy]:
+    """Yield the policy after each iteration.
+
+    Both signs of a perturbation see the same episode seed, so their difference is due to the perturbation.
+
+    Args:
+        rollout: plays one episode.
+        shape: (actions, features) of the policy.
+        settings: the constants.
+        rng: all randomness of the search.
+    """
+    weights, moments = np.zeros(shape), RunningMoments(shape[1])
+    for _ in range(settings.iterations):
+        deltas = rng.standard_normal((settings.directions, *shape))
+        seeds = rng.integers(2**31, size=settings.directions)
+        returns, visited = np.empty((settings.directions, 2)), []
+        for i, (delta, seed) in enumerate(zip(deltas, seeds, strict=True)):
+            for j, sign in enumerate((1.0, -1.0)):
+                policy = LinearPolicy(weights + sign * settings.noise * delta, moments.mean, moments.std)
+                returns[i, j], states = rollout(policy, int(seed))
+                visited.append(states)
+        weights = weights + ascent(deltas, returns, settings)
+        moments.add(np.concatenate(visited))
+        yield LinearPolicy(weights, moments.mean, moments.std)
+
+
+def ascent(deltas: np.ndarray, returns: np.ndarray, settings: ArsSettings) -> np.ndarray:
+    """The update of the weights: the best `top` perturbations, each weighted by its gain, over the returns' spread."""
+    best = np.argsort(-returns.max(axis=1), kind="stable")[: settings.top]
+    gain = returns[best, 0] - returns[best, 1]
+    spread = max(float(returns[best].std()), 1e-8)
+    return settings.step / (settings.top * spread) * np.tensordot(gain, deltas[best], axes=1)

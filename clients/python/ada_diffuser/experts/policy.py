@@ -1,0 +1,99 @@
+"""What an expert is: a function of the observation and the true context; and its file."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+
+class Expert(Protocol):
+    """Anything that flies an environment with its context in sight."""
+
+    card: dict[str, Any]
+
+    def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
+        """Action for an observation and the context of the coming step; not clipped."""
+        ...
+
+
+@dataclass
+class AnalyticPilot:
+    """PointWind-S: proportional-derivative control that cancels the wind, `(-3 p - 2.5 v - w) / 4`."""
+
+    card: dict[str, Any] = field(default_factory=lambda: {"kind": "analytic", "law": "clip((-3 p - 2.5 v - w_t u) / 4)"})
+
+    def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
+        """See `Expert.act`; observation (4,), context (2,), action (2,)."""
+        return (-3.0 * observation[:2] - 2.5 * observation[2:] - context) / 4.0
+
+
+@dataclass(frozen=True)
+class LinearPolicy:
+    """`a = W ((x - mean) / std)` over `x`, the observation with or without the context behind it.
+
+    Attributes:
+        weights: W, shape (actions, features).
+        mean: running mean of `x` in training, shape (features,).
+        std: its standard deviation, shape (features,).
+    """
+
+    weights: np.ndarray
+    mean: np.ndarray
+    std: np.ndarray
+
+    def act(self, features: np.ndarray) -> np.ndarray:
+        """Action (actions,) for features (features,)."""
+        return self.weights @ ((features - self.mean) / self.std)
+
+
+@dataclass
+class PolicyBank:
+    """One linear policy that takes the context as an input, or several, of which the nearest to the context acts.
+
+    Attributes:
+        policies: at least one.
+        targets: the context each was trained for, shape (policies,); None where the one policy reads the context.
+        card: how they were made and what they reach.
+    """
+
+    policies: list[LinearPolicy]
+    targets: np.ndarray | None
+    card: dict[str, Any]
+
+    def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
+        """See `Expert.act`."""
+        if self.targets is None:
+            return self.policies[0].act(np.concatenate([observation, context]))
+        return self.policies[int(np.argmin(np.abs(self.targets - context[0])))].act(observation)
+
+
+def save_expert(expert: PolicyBank, path: Path) -> None:
+    """Write the policies and their card to one `.npz`; the same bytes for the same expert."""
+    arrays = {
+        "weights": np.stack([p.weights for p in expert.policies]),
+        "mean": np.stack([p.mean for p in expert.policies]),
+        "std": np.stack([p.std for p in expert.policies]),
+        "card": np.array(json.dumps(expert.card, sort_keys=True)),
+    }
+    if expert.targets is not None:
+        arrays["targets"] = expert.targets
+    partial = path.with_name(f".{path.name}.partial.npz")
+    np.savez(partial, **arrays)
+    os.replace(partial, path)
+
+
+def load_expert(path: Path) -> PolicyBank:
+    """Read what `save_expert` wrote. Raises `ValueError` naming the file if it is not an expert."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            stacked = zip(file["weights"], file["mean"], file["std"], strict=True)
+            policies = [LinearPolicy(*arrays) for arrays in stacked]
+            targets = file["targets"] if "targets" in file else None
+            return PolicyBank(policies, targets, json.loads(str(file["card"])))
+    except (KeyError, ValueError, EOFError) as error:
+        raise ValueError(f"{path} is not an expert written by ada-collect: {error}") from error

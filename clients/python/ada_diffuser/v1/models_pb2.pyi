@@ -1,0 +1,89 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class LatentMode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    LATENT_MODE_UNSPECIFIED: _ClassVar[LatentMode]
+    LATENT_MODE_MEAN: _ClassVar[LatentMode]
+    LATENT_MODE_SAMPLE: _ClassVar[LatentMode]
+LATENT_MODE_UNSPECIFIED: LatentMode
+LATENT_MODE_MEAN: LatentMode
+LATENT_MODE_SAMPLE: LatentMode
+
+class ListModelsRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ListModelsResponse(_message.Message):
+    __slots__ = ("models",)
+    MODELS_FIELD_NUMBER: _ClassVar[int]
+    models: _containers.RepeatedCompositeFieldContainer[Model]
+    def __init__(self, models: _Optional[_Iterable[_Union[Model, _Mapping]]] = ...) -> None: ...
+
+class GetModelRequest(_message.Message):
+    __slots__ = ("model",)
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    model: str
+    def __init__(self, model: _Optional[str] = ...) -> None: ...
+
+class GetModelResponse(_message.Message):
+    __slots__ = ("model",)
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    model: Model
+    def __init__(self, model: _Optional[_Union[Model, _Mapping]] = ...) -> None: ...
+
+class Model(_message.Message):
+    __slots__ = ("name", "digest", "is_default", "state_dim", "action_dim", "plan_horizon", "block_len", "obs_horizon", "latent_dim", "level_max", "action_low", "action_high", "sampler", "refined")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    DIGEST_FIELD_NUMBER: _ClassVar[int]
+    IS_DEFAULT_FIELD_NUMBER: _ClassVar[int]
+    STATE_DIM_FIELD_NUMBER: _ClassVar[int]
+    ACTION_DIM_FIELD_NUMBER: _ClassVar[int]
+    PLAN_HORIZON_FIELD_NUMBER: _ClassVar[int]
+    BLOCK_LEN_FIELD_NUMBER: _ClassVar[int]
+    OBS_HORIZON_FIELD_NUMBER: _ClassVar[int]
+    LATENT_DIM_FIELD_NUMBER: _ClassVar[int]
+    LEVEL_MAX_FIELD_NUMBER: _ClassVar[int]
+    ACTION_LOW_FIELD_NUMBER: _ClassVar[int]
+    ACTION_HIGH_FIELD_NUMBER: _ClassVar[int]
+    SAMPLER_FIELD_NUMBER: _ClassVar[int]
+    REFINED_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    digest: str
+    is_default: bool
+    state_dim: int
+    action_dim: int
+    plan_horizon: int
+    block_len: int
+    obs_horizon: int
+    latent_dim: int
+    level_max: int
+    action_low: _containers.RepeatedScalarFieldContainer[float]
+    action_high: _containers.RepeatedScalarFieldContainer[float]
+    sampler: SamplerOptions
+    refined: bool
+    def __init__(self, name: _Optional[str] = ..., digest: _Optional[str] = ..., is_default: bool = ..., state_dim: _Optional[int] = ..., action_dim: _Optional[int] = ..., plan_horizon: _Optional[int] = ..., block_len: _Optional[int] = ..., obs_horizon: _Optional[int] = ..., latent_dim: _Optional[int] = ..., level_max: _Optional[int] = ..., action_low: _Optional[_Iterable[float]] = ..., action_high: _Optional[_Iterable[float]] = ..., sampler: _Optional[_Union[SamplerOptions, _Mapping]] = ..., refined: bool = ...) -> None: ...
+
+class SamplerOptions(_message.Message):
+    __slots__ = ("streaming", "action_horizon", "sub_steps", "eta", "temperature", "kappa", "latent")
+    STREAMING_FIELD_NUMBER: _ClassVar[int]
+    ACTION_HORIZON_FIELD_NUMBER: _ClassVar[int]
+    SUB_STEPS_FIELD_NUMBER: _ClassVar[int]
+    ETA_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_FIELD_NUMBER: _ClassVar[int]
+    KAPPA_FIELD_NUMBER: _ClassVar[int]
+    LATENT_FIELD_NUMBER: _ClassVar[int]
+    streaming: bool
+    action_horizon: int
+    sub_steps: int
+    eta: float
+    temperature: float
+    kappa: float
+    latent: LatentMode
+    def __init__(self, streaming: bool = ..., action_horizon: _Optional[int] = ..., sub_steps: _Optional[int] = ..., eta: _Optional[float] = ..., temperature: _Optional[float] = ..., kappa: _Optional[float] = ..., latent: _Optional[_Union[LatentMode, str]] = ...) -> None: ...

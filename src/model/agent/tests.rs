@@ -1,0 +1,224 @@
+//! Invariants of the sampler (algorithm 3): evaluations, determinism, batch invariance, streaming, retries, horizons.
+
+use super::*;
+use crate::model::{
+    config::Restart,
+    denoiser::DenoiserConfig,
+    latent::LatentConfig,
+    nn::params::Params,
+    noise::Philox,
+    normalizer::{Affine, Normalizer},
+    trajectory::Layout,
+};
+
+const HORIZON: usize = 8;
+
+fn options() -> SamplerOptions {
+    SamplerOptions {
+        streaming: true,
+        action_horizon: 1,
+        sub_steps: 1,
+        eta: 0.0,
+        temperature: 0.5,
+        kappa: 0.1,
+        latent: LatentMode::Mean,
+    }
+}
+
+fn agent(latents: bool, obs_horizon: usize, denoiser: DenoiserConfig) -> Agent {
+    let config = ModelConfig {
+        layout: Layout { state_dim: 3, action_dim: 2 },
+        plan_horizon: HORIZON,
+        block_len: 4,
+        obs_horizon,
+        level_max: 40,
+        latent: latents.then_some(LatentConfig { dim: 5, hidden: 16 }),
+        denoiser,
+        state_clip: 5.0,
+        action_low: vec![-1.0; 2],
+        action_high: vec![1.0; 2],
+        normalizer: Normalizer {
+            state: Affine { mean: vec![0.5, 0.0, -0.5], std: vec![2.0, 1.0, 0.5] },
+            action: Affine::identity(2),
+            reward: Affine::identity(1),
+            state_change_std: vec![1.0; 3],
+        },
+        refined: true,
+        latent_spread: 1.0,
+        restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY },
+        sampler: options(),
+    };
+    let networks = Networks::new(&config, &Params::fresh(3)).unwrap();
+    Agent::new(config, networks, "test".into())
+}
+
+fn unet() -> DenoiserConfig {
+    DenoiserConfig::Unet { widths: vec![8, 16, 16] }
+}
+
+fn observation(stream: &mut Philox) -> Observation {
+    Observation { state: (0..3).map(|_| stream.normal()).collect(), executed: Vec::new() }
+}
+
+/// Runs `acts` acts of one episode.
+fn run(agent: &Agent, seed: u64, options: &SamplerOptions, acts: usize) -> Vec<Chunk> {
+    let mut stream = Philox::new(99);
+    let mut episode = agent.open(seed, options).unwrap();
+    let step = |_| {
+        let (next, chunk) = agent.act(&episode, &observation(&mut stream)).unwrap();
+        episode = next;
+        chunk
+    };
+    (0..acts).map(step).collect()
+}
+
+#[test]
+fn evaluations_follow_the_formulas() {
+    let agent = agent(true, 1, unet());
+    for (sub_steps, action_horizon) in [(1, 1), (2, 1), (1, 3), (3, 2)] {
+        let options = SamplerOptions { sub_steps, action_horizon, ..options() };
+        let chunks = run(&agent, 1, &options, 3);
+        let cold = (sub_steps * (HORIZON - 1 + action_horizon)) as u32;
+        assert_eq!((chunks[0].evaluations, chunks[0].start), (cold, Start::Cold));
+        assert_eq!((chunks[1].evaluations, chunks[1].start), ((sub_steps * action_horizon) as u32, Start::Warm));
+        assert!(chunks.iter().all(|chunk| chunk.actions.len() == action_horizon));
+        let chunks = run(&agent, 1, &SamplerOptions { streaming: false, ..options }, 2);
+        assert!(chunks.iter().all(|chunk| chunk.evaluations == cold));
+    }
+}
+
+#[test]
+fn same_seed_same_bytes_other_seed_others() {
+    for agent in [agent(true, 1, unet()), agent(false, 3, DenoiserConfig::Dit { width: 16, depth: 1, heads: 2 })] {
+        let options = SamplerOptions { eta: 1.0, latent: LatentMode::Sample, ..options() };
+        assert_eq!(run(&agent, 5, &options, 4), run(&agent, 5, &options, 4));
+        assert_ne!(run(&agent, 5, &options, 1)[0].actions, run(&agent, 6, &options, 1)[0].actions);
+    }
+}
+
+/// Rows of a forward do not influence each other, whatever rungs they stand on and whatever their options.
+#[test]
+fn a_batch_is_its_rows() {
+    let agent = agent(true, 3, unet());
+    let vary = |i: u64| SamplerOptions {
+        kappa: [0.0, 0.1, f32::INFINITY][i as usize % 3],
+        action_horizon: 1 + i as usize % 3,
+        sub_steps: 1 + i as usize % 2,
+        ..options()
+    };
+    let mut stream = Philox::new(4);
+    let observations: Vec<Observation> = (0..7).map(|_| observation(&mut stream)).collect();
+    let episodes: Vec<Episode> = (0..7).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
+    let alone: Vec<_> = episodes.iter().zip(&observations).map(|(episode, seen)| agent.act(episode, seen).unwrap()).collect();
+    let mut waiting: Vec<(usize, Descent)> = Vec::new();
+    let mut together: Vec<Option<(Episode, Chunk)>> = vec![None; 7];
+    let mut next = 0;
+    while together.iter().any(Option::is_none) {
+        if next < 7 {
+            waiting.push((next, agent.begin(&episodes[next], &observations[next]).unwrap()));
+            next += 1;
+        }
+        let (indices, mut descents): (Vec<_>, Vec<_>) = waiting.into_iter().unzip();
+        agent.advance(&mut descents).unwrap();
+        let (done, rest): (Vec<_>, Vec<_>) = indices.into_iter().zip(descents).partition(|(_, descent)| descent.is_done());
+        done.into_iter().for_each(|(index, descent)| together[index] = Some(agent.finish(descent).unwrap()));
+        waiting = rest;
+    }
+    assert_eq!(together.into_iter().flatten().collect::<Vec<_>>(), alone);
+}
+
+/// One act of three actions is the first three emissions of three acts of one, when what was imagined then really happened and the
+/// real tokens and states are left out of the comparison: here, with no latents and no observations, the first emission is the same.
+#[test]
+fn the_first_action_does_not_depend_on_the_action_horizon() {
+    let agent = agent(true, 1, unet());
+    let one = run(&agent, 2, &options(), 1);
+    let three = run(&agent, 2, &SamplerOptions { action_horizon: 3, ..options() }, 1);
+    assert_eq!(one[0].actions[0], three[0].actions[0]);
+    assert_ne!(three[0].actions[0], three[0].actions[1]);
+}
+
+/// The window that streaming keeps is the cold ladder's own: the second act, warm, with the state the first one predicted and no news
+/// for the latent, gives what the first would have given as its second action.
+#[test]
+fn a_warm_act_continues_the_ladder() {
+    let agent = agent(false, 1, unet());
+    let two = run(&agent, 8, &SamplerOptions { action_horizon: 2, ..options() }, 1).remove(0);
+    let mut stream = Philox::new(99);
+    let episode = agent.open(8, &options()).unwrap();
+    let (episode, first) = agent.act(&episode, &observation(&mut stream)).unwrap();
+    assert_eq!(first.actions[0], two.actions[0]);
+    // The state at position 0 is the imagined one at rung 1; hand the same numbers in as if they had been observed.
+    let raw = agent.config.normalizer.state.denormalize(&episode.window.as_ref().unwrap().x[..3]);
+    let (_, second) = agent.act(&episode, &Observation { state: raw, executed: Vec::new() }).unwrap();
+    let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-4);
+    assert!(close(&second.actions[0], &two.actions[1]), "{:?} {:?}", second.actions[0], two.actions[1]);
+}
+
+#[test]
+fn surprise_and_latent_jumps_restart() {
+    let mut agent = agent(true, 1, unet());
+    let start_of_second = |agent: &Agent| run(agent, 1, &options(), 2)[1].start;
+    agent.config.restart = Restart { renoise_distance: 0.0, cold_distance: 1e6, latent_jump: f32::INFINITY };
+    assert_eq!(start_of_second(&agent), Start::Renoised(2));
+    assert_eq!(run(&agent, 1, &options(), 2)[1].evaluations, 3);
+    agent.config.restart = Restart { renoise_distance: 0.0, cold_distance: 0.0, latent_jump: f32::INFINITY };
+    assert_eq!(start_of_second(&agent), Start::Cold);
+    agent.config.restart = Restart { renoise_distance: 1e6, cold_distance: 1e6, latent_jump: 0.0 };
+    assert_eq!(start_of_second(&agent), Start::Cold);
+}
+
+/// The trust region: 0 leaves the filter's latent, infinity takes the posterior's, and a little moves it a little.
+#[test]
+fn kappa_bounds_the_refinement() {
+    let agent = agent(true, 1, unet());
+    let latent = |kappa| run(&agent, 1, &SamplerOptions { kappa, ..options() }, 1)[0].latent_mean.clone();
+    let distance = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt();
+    let (off, small, printed) = (latent(0.0), latent(1e-3), latent(f32::INFINITY));
+    assert!(distance(&off, &small) > 0.0 && distance(&off, &small) < distance(&off, &printed));
+}
+
+#[test]
+fn history_reaches_the_latent_and_missing_parts_are_allowed() {
+    let agent = agent(true, 1, unet());
+    let mut stream = Philox::new(1);
+    let (episode, _) = agent.act(&agent.open(1, &options()).unwrap(), &observation(&mut stream)).unwrap();
+    let seen = |executed| Observation { state: vec![0.1, 0.2, 0.3], executed };
+    let latent = |executed| agent.act(&episode, &seen(executed)).unwrap().1.latent_mean;
+    let bare = latent(vec![]);
+    let rewarded = latent(vec![Executed { reward: Some(2.0), ..Executed::default() }]);
+    let other = latent(vec![Executed { action: Some(vec![0.9, -0.9]), ..Executed::default() }]);
+    assert!(bare != rewarded && bare != other && rewarded != other);
+}
+
+#[test]
+fn bad_observations_name_the_field() {
+    let agent = agent(true, 1, unet());
+    let episode = agent.open(1, &options()).unwrap();
+    let field = |state: Vec<f32>, executed| match agent.begin(&episode, &Observation { state, executed }) {
+        Err(AgentError::InvalidObservation { field, .. }) => field,
+        other => panic!("{other:?}"),
+    };
+    let executed = |action: Option<Vec<f32>>, reward| vec![Executed { state: None, action, reward }];
+    assert_eq!(field(vec![0.0; 2], vec![]), "state");
+    assert_eq!(field(vec![0.0, f32::NAN, 0.0], vec![]), "state[1]");
+    assert_eq!(field(vec![0.0; 3], executed(None, None)), "executed[0].action");
+    assert_eq!(field(vec![0.0; 3], executed(Some(vec![0.0]), None)), "executed[0].action");
+    assert_eq!(field(vec![0.0; 3], executed(Some(vec![0.0; 2]), Some(f32::INFINITY))), "executed[0].reward[0]");
+}
+
+#[test]
+fn bad_options_name_the_field() {
+    let mut agent = agent(true, 1, unet());
+    let field = |agent: &Agent, options: SamplerOptions| match agent.open(1, &options) {
+        Err(AgentError::InvalidOptions { field, .. }) => field,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(field(&agent, SamplerOptions { action_horizon: 9, ..options() }), "action_horizon");
+    assert_eq!(field(&agent, SamplerOptions { sub_steps: 6, ..options() }), "sub_steps");
+    assert_eq!(field(&agent, SamplerOptions { eta: 1.5, ..options() }), "eta");
+    assert_eq!(field(&agent, SamplerOptions { temperature: f32::NAN, ..options() }), "temperature");
+    assert_eq!(field(&agent, SamplerOptions { kappa: -1.0, ..options() }), "kappa");
+    agent.config.refined = false;
+    assert_eq!(field(&agent, options()), "kappa");
+}

@@ -1,0 +1,128 @@
+"""`ada-collect` writes the layout it promises, the same bytes for the same arguments, and clear errors."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from ada_diffuser import collect as cli
+from ada_diffuser.dataset import card_path, load_episodes
+from ada_diffuser.experts import AnalyticPilot
+
+TINY = ["--episodes", "3", "--quiet", "--expert-searches", "1", "--expert-iterations", "1"]
+
+
+def run(out, *flags):
+    return cli.main(["--out", str(out), *TINY, *flags])
+
+
+@pytest.mark.parametrize("name", ["point-wind-s", "cheetah-wind-s"])
+def test_same_arguments_same_bytes_and_another_seed_other_bytes(name, tmp_path):
+    paths = [tmp_path / "a" / "x.h5", tmp_path / "b" / "x.h5"]
+    for path in paths:
+        assert run(path, "--env", name, "--seed", "5") == 0
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    assert run(tmp_path / "a" / "x.h5", "--env", name, "--seed", "6") == 0
+    assert paths[0].read_bytes() != paths[1].read_bytes()
+
+
+def test_layout_is_d4rls(tmp_path):
+    path = tmp_path / "x.h5"
+    assert run(path, "--env", "point-wind-s") == 0
+    with h5py.File(path) as file:
+        shapes = {name: (file[name].shape, file[name].dtype) for name in ("observations", "actions", "rewards", "infos/context")}
+        assert shapes["observations"] == ((600, 4), np.float32)
+        assert shapes["actions"] == ((600, 2), np.float32)
+        assert shapes["rewards"] == ((600,), np.float32)
+        assert shapes["infos/context"] == ((600, 2), np.float32)
+        assert file["terminals"].dtype == file["timeouts"].dtype == np.bool_
+        assert np.flatnonzero(file["timeouts"][()]).tolist() == [199, 399, 599] and not file["terminals"][()].any()
+        noise = file["infos/action_noise"][()].reshape(3, 200)
+        assert (noise == noise[:, :1]).all() and np.isin(noise, np.float32([0.1, 0.2, 0.3])).all()
+
+
+def test_rows_hold_the_step_as_it_was_executed():
+    """Row t: the state before the step, the clipped noisy action, its reward, the wind that blew in it."""
+    job = cli.Job("point-wind-s", {"sigma": 0.0}, 2, (0.5,), seed=1)
+    episodes, failures = cli.collect(job, AnalyticPilot())
+    for start in (0, 200):
+        rows = slice(start, start + 199)
+        velocity = episodes.observations[rows, 2:]
+        following = episodes.observations[start + 1 : start + 200]
+        action, wind = episodes.actions[rows], episodes.context[rows]
+        expected = velocity + 0.1 * (4 * action - 0.8 * velocity + wind)
+        assert np.allclose(following[:, 2:], expected, atol=1e-5)
+        cost = -np.linalg.norm(following[:, :2], axis=1) - 0.05 * (action**2).sum(1)
+        assert np.allclose(episodes.rewards[rows], cost, atol=1e-5)
+    assert np.abs(episodes.actions).max() == 1.0, "noise this large reaches the bounds, and what is stored is clipped"
+    assert len(episodes.returns()) == 2 and episodes.returns().sum() == pytest.approx(episodes.rewards.sum(), rel=1e-4)
+    assert failures == int((episodes.returns() < -60).sum())
+
+
+def test_the_card_tells_what_the_file_is(tmp_path, capsys):
+    path = tmp_path / "x.h5"
+    assert run(path, "--env", "cheetah-wind-s", "--option", "gain=2", "--seed", "3", "--json") == 0
+    card = json.loads(card_path(path).read_text())
+    assert json.loads(capsys.readouterr().out) == card
+    assert card["environment"] == {"id": "ada/CheetahWind-S-v0", "options": {"gain": 2}}
+    assert card["file"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert (card["seed"], card["episodes"], card["steps"]) == (3, 3, 600)
+    assert card["expert"]["recipe"]["options"] == {"gain": 2}
+    assert "--option gain=2" in card["command"]
+    returns = load_episodes(path).returns()
+    assert card["returns"]["mean"] == pytest.approx(returns.mean(), abs=1e-3)
+    assert card["returns"]["failures"] == 3, "an expert after one update stands still"
+
+
+def test_the_expert_beside_the_data_is_used_again_only_for_its_own_recipe(tmp_path, capsys):
+    path, cache = tmp_path / "x.h5", tmp_path / "x.expert.npz"
+    run(path, "--env", "cheetah-wind-s")
+    first = cache.stat().st_mtime_ns
+    run(path, "--env", "cheetah-wind-s", "--seed", "9")
+    assert cache.stat().st_mtime_ns == first
+    run(path, "--env", "cheetah-wind-s", "--option", "gain=2")
+    assert cache.stat().st_mtime_ns != first and "another recipe" in capsys.readouterr().err
+
+
+def test_a_given_expert_flies_instead(tmp_path):
+    path = tmp_path / "x.h5"
+    run(path, "--env", "cheetah-wind-s")
+    expert = tmp_path / "x.expert.npz"
+    assert run(tmp_path / "y.h5", "--env", "cheetah-wind-s", "--expert", str(expert)) == 0
+    assert path.read_bytes() == (tmp_path / "y.h5").read_bytes()
+    assert not (tmp_path / "y.expert.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"),
+    [
+        (["--env", "cheetah-rain"], "cheetah-wind-s"),
+        (["--env", "point-wind-s", "--episodes", "0"], "--episodes"),
+        (["--env", "point-wind-s", "--option", "sigma"], "--option"),
+        (["--env", "point-wind-s", "--option", "sigmas=1"], "sigmas"),
+        (["--env", "point-wind-s", "--action-noise", "a,b"], "--action-noise"),
+        (["--env", "point-wind-s", "--action-noise=-1"], "--action-noise"),
+        (["--env", "cheetah-wind-s", "--expert", "missing.npz"], "missing.npz"),
+    ],
+)
+def test_wrong_arguments_are_named_and_write_nothing(flags, word, tmp_path, capsys):
+    out = tmp_path / "x.h5"
+    assert cli.main(["--out", str(out), "--quiet", *flags]) == 2
+    assert word in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_the_output_must_be_hdf5(tmp_path, capsys):
+    assert run(tmp_path / "x.csv", "--env", "point-wind-s") == 2
+    assert "--out" in capsys.readouterr().err
+
+
+def test_an_expert_of_another_shape_is_refused(tmp_path, capsys):
+    run(tmp_path / "x.h5", "--env", "cheetah-vel-e")
+    expert = tmp_path / "x.expert.npz"
+    assert run(tmp_path / "y.h5", "--env", "point-wind-s", "--expert", str(expert)) == 2
+    assert "expert" in capsys.readouterr().err

@@ -1,0 +1,253 @@
+"""The environments do what their definitions say, and hide what they say they hide."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from ada_diffuser import environments
+from ada_diffuser.environments.half_cheetah import XML, HalfCheetahBody
+
+CHEETAHS = [name for name in environments.NAMES if name.startswith("cheetah")]
+
+
+@pytest.mark.parametrize("name", environments.NAMES)
+def test_passes_gymnasiums_own_checker(name):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error")
+        warnings.filterwarnings("ignore", message=".*(minimum|maximum) value is -?infinity.*")
+        check_env(environments.make(name).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("name", environments.NAMES)
+def test_truncates_after_200_steps_and_never_terminates(name):
+    env = environments.make(name)
+    env.reset(seed=0)
+    ends = [env.step(env.action_space.sample())[2:4] for _ in range(200)]
+    assert ends[:-1] == [(False, False)] * 199 and ends[-1] == (False, True)
+
+
+@pytest.mark.parametrize("name", environments.NAMES)
+def test_observations_are_float32_and_do_not_hold_the_context(name):
+    env = environments.make(name)
+    observation, info = env.reset(seed=3)
+    assert observation.dtype == np.float32 and env.observation_space.contains(observation)
+    assert info["context"].dtype == np.float32 and info["context"].ndim == 1
+    assert not np.isin(info["context"], observation).any()
+
+
+@pytest.mark.parametrize("name", environments.NAMES)
+def test_same_seed_same_episode(name):
+    def episode(seed):
+        env = environments.make(name)
+        rows = [env.reset(seed=seed)[0]]
+        rng = np.random.default_rng(1)
+        for _ in range(20):
+            observation, reward, _, _, info = env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+            rows.append(np.concatenate([observation, [reward], info["context"]]))
+        return np.concatenate(rows)
+
+    assert np.array_equal(episode(5), episode(5))
+    assert not np.array_equal(episode(5), episode(6))
+
+
+@pytest.mark.parametrize("name", environments.NAMES)
+def test_a_steps_info_holds_the_context_that_acted_in_it(name):
+    env = environments.make(name).unwrapped
+    _, info = env.reset(seed=2)
+    announced = info["context"]
+    for _ in range(5):
+        assert np.array_equal(announced, env.context)
+        info = env.step(np.zeros(env.action_space.shape, np.float32))[4]
+        assert np.array_equal(info["context"], announced)
+        announced = env.context
+
+
+def test_unknown_names_and_options_are_refused_with_the_choices():
+    with pytest.raises(ValueError, match="point-wind-s"):
+        environments.make("cheetah-rain")
+    with pytest.raises(ValueError, match="rootx"):
+        environments.make("cheetah-wind-s", wind_on="tail")
+    with pytest.raises(ValueError, match="lilac"):
+        environments.make("cheetah-vel-e", targets="fast")
+
+
+def test_register_all_twice_changes_nothing():
+    before = dict(gym.registry)
+    environments.register_all()
+    assert dict(gym.registry) == before
+
+
+# ---- PointWind-S ----
+
+
+def test_point_wind_follows_its_equations():
+    env = environments.PointWindS(sigma=0.0)
+    observation, _ = env.reset(seed=4)
+    position, velocity = observation[:2].astype(float), observation[2:].astype(float)
+    assert np.array_equal(velocity, np.zeros(2)) and np.abs(position).max() <= 1
+    for action in ([1.0, -0.5], [-3.0, 0.25]):
+        context = env.context.astype(float)
+        observation, reward, *_ = env.step(np.array(action, np.float32))
+        clipped = np.clip(action, -1, 1)
+        velocity = velocity + 0.1 * (4 * clipped - 0.8 * velocity + context)
+        position = position + 0.1 * velocity
+        assert np.allclose(observation, np.concatenate([position, velocity]), atol=1e-6)
+        assert reward == pytest.approx(-np.hypot(*position) - 0.05 * clipped @ clipped, abs=1e-6)
+
+
+def test_point_wind_blows_along_one_line_with_the_stated_strength():
+    env = environments.PointWindS(phase=0.0)
+    _, info = env.reset(seed=4)
+    contexts = [info["context"]] + [env.step(np.zeros(2, np.float32)) and env.context for _ in range(40)]
+    strength = [2 + 2 * math.sin(0.2 * t) for t in range(41)]
+    direction = contexts[0] / 2
+    assert np.hypot(*direction) == pytest.approx(1, abs=1e-6)
+    assert np.allclose(contexts, np.outer(strength, direction), atol=1e-5)
+
+
+def test_point_wind_draws_wind_anew_in_each_episode():
+    env = environments.PointWindS()
+    first = env.reset(seed=1)[1]["context"]
+    assert not np.allclose(first, env.reset()[1]["context"])
+
+
+# ---- the cheetah's body ----
+
+
+def test_the_body_is_gymnasiums_half_cheetah():
+    import mujoco
+
+    body, reference = HalfCheetahBody(), mujoco.MjModel.from_xml_path(str(XML))
+    assert np.array_equal(body.model.body_mass, reference.body_mass)
+    assert np.array_equal(body.model.dof_invweight0, reference.dof_invweight0)
+    env = gym.make("HalfCheetah-v5").unwrapped
+    theirs = env.reset(seed=9)[0]
+    body.reset(np.random.Generator(np.random.PCG64(np.random.SeedSequence(9))))
+    assert np.allclose(body.observation(), theirs, atol=1e-6)
+    for action in np.random.default_rng(0).uniform(-1, 1, (10, 6)):
+        theirs, _, _, _, info = env.step(action)
+        speed = body.step(action, 0.0)
+        assert np.allclose(body.observation(), theirs, atol=1e-5)
+        assert speed == pytest.approx(info["x_velocity"], abs=1e-9)
+
+
+def gust(wind_on, force, steps=5):
+    """x travelled by a limp body in `steps` control steps against `force` N."""
+    body = HalfCheetahBody(wind_on)
+    body.reset(np.random.default_rng(0))
+    start = body.x
+    for _ in range(steps):
+        body.step(np.zeros(6), force)
+    return body.x - start
+
+
+@pytest.mark.parametrize("wind_on", ["torso", "all_bodies", "rootx"])
+def test_a_head_wind_pushes_the_cheetah_back_and_a_tail_wind_forth(wind_on):
+    still = gust(wind_on, 0.0)
+    assert gust(wind_on, 10.0) < still - 0.01
+    assert gust(wind_on, -10.0) > still + 0.01
+
+
+def test_wind_on_rootx_equals_wind_on_the_torso_and_all_bodies_is_stronger():
+    still = gust("torso", 0.0, steps=1)
+    torso, rootx, everything = (gust(where, 10.0, steps=1) - still for where in ("torso", "rootx", "all_bodies"))
+    assert torso == pytest.approx(rootx, rel=0.35)
+    assert everything < 2 * torso
+
+
+def test_wind_is_a_force_along_x_and_no_torque():
+    """A public wrapper sets `force = [0] * 5 + [w]`: a torque about z, which moves nothing in a planar body."""
+    body = HalfCheetahBody()
+    body.reset(np.random.default_rng(0))
+    body.step(np.zeros(6), 7.0)
+    applied = body.data.xfrc_applied
+    torso = body.model.body("torso").id
+    assert applied[torso].tolist() == [-7.0, 0, 0, 0, 0, 0]
+    assert np.count_nonzero(applied) == 1
+
+
+@pytest.mark.parametrize("wind_on", ["torso", "all_bodies", "rootx"])
+def test_wind_does_not_outlive_the_episode_or_the_step(wind_on):
+    body = HalfCheetahBody(wind_on)
+    body.reset(np.random.default_rng(0))
+    body.step(np.zeros(6), 7.0)
+    body.step(np.zeros(6), 0.0)
+    assert not body.data.xfrc_applied.any() and not body.data.qfrc_applied.any()
+    body.step(np.zeros(6), 7.0)
+    body.reset(np.random.default_rng(0))
+    assert not body.data.xfrc_applied.any() and not body.data.qfrc_applied.any()
+
+
+# ---- the cheetah's tasks ----
+
+
+@pytest.mark.parametrize("name", CHEETAHS)
+def test_cheetah_reward_is_speed_error_and_effort_of_the_clipped_action(name):
+    env = environments.make(name).unwrapped
+    env.reset(seed=1)
+    for action in np.random.default_rng(0).uniform(-1.5, 1.5, (10, 6)).astype(np.float32):
+        _, reward, _, _, info = env.step(action)
+        target = info["context"][0] if name == "cheetah-vel-e" else 1.5
+        clipped = np.clip(action, -1, 1)
+        assert reward == pytest.approx(-abs(info["x_velocity"] - target) - 0.05 * clipped @ clipped, abs=1e-5)
+
+
+def test_wind_s_is_the_papers_wind_at_phase_0_and_reaches_the_simulator():
+    env = environments.make("cheetah-wind-s", phase=0.0, gain=2.0).unwrapped
+    env.reset(seed=0)
+    torso = env.body.model.body("torso").id
+    for t in range(30):
+        context = env.step(np.zeros(6, np.float32))[4]["context"][0]
+        assert context == pytest.approx(2 * (5 + 5 * math.sin(0.5 * t)), abs=1e-5)
+        assert env.body.data.xfrc_applied[torso, 0] == pytest.approx(-context, abs=1e-5)
+
+
+def test_wind_s_draws_a_phase_in_each_episode():
+    env = environments.make("cheetah-wind-s").unwrapped
+    first = env.reset(seed=0)[1]["context"][0]
+    assert len({first, *(env.reset()[1]["context"][0] for _ in range(4))}) == 5
+
+
+def test_wind_e_is_constant_within_an_episode_and_follows_the_episode_number():
+    env = environments.make("cheetah-wind-e", phase=0.0).unwrapped
+    env.reset(seed=0)
+    for i in range(4):
+        winds = {env.step(np.zeros(6, np.float32))[4]["context"][0] for _ in range(3)}
+        assert winds == {np.float32(10 + 5 * math.sin(0.8 * i))}
+        env.reset()
+    assert env.reset(options={"episode": 7})[1]["context"][0] == np.float32(10 + 5 * math.sin(0.8 * 7))
+    assert env.reset(seed=1)[1]["context"][0] == 10.0, "a seed starts a new session"
+
+
+def test_wind_e_keeps_its_phase_within_a_session():
+    env = environments.make("cheetah-wind-e").unwrapped
+    first = env.reset(seed=3)[1]["context"][0]
+    env.reset()
+    assert env.reset(options={"episode": 0})[1]["context"][0] == first
+
+
+def test_vel_e_draws_from_its_targets():
+    def speeds(**options):
+        env = environments.make("cheetah-vel-e", **options).unwrapped
+        return [env.reset(seed=0)[1]["context"][0]] + [env.reset()[1]["context"][0] for _ in range(30)]
+
+    assert set(speeds()) == {1.0, 2.5}
+    assert set(speeds(targets=[0.5])) == {0.5}
+    uniform = speeds(targets="uniform")
+    assert len(set(uniform)) == 31 and 0 <= min(uniform) < 1 and 2 < max(uniform) <= 3
+    assert np.allclose(speeds(targets="lilac"), [1.5 + 1.5 * math.sin(0.5 * i) for i in range(31)], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", environments.NAMES)
+def test_a_return_of_standing_still_counts_as_failed_and_an_experts_does_not(name):
+    env = environments.make(name).unwrapped
+    env.reset(seed=0)
+    still = sum(env.step(np.zeros(env.action_space.shape, np.float32))[1] for _ in range(200))
+    assert env.failed(still)
+    assert not env.failed(-50.0)
