@@ -1,13 +1,15 @@
 //! The one core behind both faces: every verb is a method here, in the words of the domain.
 
 use crate::{
-    model::agent::{LatentMode, Observation, SamplerOptions},
+    model::agent::Episode,
     serve::{
         config::Config,
-        engine::{Engine, Failure, Finished, Job, Refusal, Ticket},
+        engine::{Engine, Job, Question, Refusal},
         error::{Part, ServiceError, Stage},
         registry::{Model, Registry},
-        session::{Answer, Entry, Flight, Opening, Session, Sessions, Summary, Timings, Waiter, key_of},
+        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page},
+        seat::{RETRY_AFTER_RESTART_MS, Seat},
+        session::{Answer, Entry, Opening, Session, Sessions, Summary, Waiter, key_of},
     },
 };
 use futures_util::{Stream, StreamExt, future::join_all};
@@ -19,131 +21,10 @@ use tokio::time::timeout_at;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-/// What a client is told to wait when the server is starting or ending.
-const RETRY_AFTER_RESTART_MS: u64 = 1_000;
 /// Seeds drawn by the server stay below 2^53, so that every JSON reader keeps them exactly.
 const DRAWN_SEED_BITS: u32 = 53;
 const PAGE_LEN: usize = 100;
 const PAGE_LEN_MAX: usize = 1_000;
-
-/// Which face a request came through; a label of metrics, nothing depends on it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Face {
-    /// gRPC.
-    Grpc,
-    /// REST and WebSocket.
-    Http,
-}
-
-impl Face {
-    /// The word in metrics.
-    pub fn word(self) -> &'static str {
-        match self {
-            Face::Grpc => "grpc",
-            Face::Http => "http",
-        }
-    }
-}
-
-/// Overrides of a model's sampling defaults; None: as the model has it. Fields as in [`SamplerOptions`].
-#[derive(Clone, Debug, Default, PartialEq)]
-#[allow(missing_docs)]
-pub struct OptionsPatch {
-    pub streaming: Option<bool>,
-    pub action_horizon: Option<usize>,
-    pub sub_steps: Option<usize>,
-    pub eta: Option<f32>,
-    pub temperature: Option<f32>,
-    pub kappa: Option<f32>,
-    pub latent: Option<LatentMode>,
-}
-
-impl OptionsPatch {
-    fn onto(self, default: &SamplerOptions) -> SamplerOptions {
-        let Self { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = self;
-        SamplerOptions {
-            streaming: streaming.unwrap_or(default.streaming),
-            action_horizon: action_horizon.unwrap_or(default.action_horizon),
-            sub_steps: sub_steps.unwrap_or(default.sub_steps),
-            eta: eta.unwrap_or(default.eta),
-            temperature: temperature.unwrap_or(default.temperature),
-            kappa: kappa.unwrap_or(default.kappa),
-            latent: latent.unwrap_or(default.latent),
-        }
-    }
-}
-
-/// OpenSession.
-#[derive(Clone, Debug, Default)]
-pub struct OpenRequest {
-    /// `name`, `name@digest` or empty for the default.
-    pub model: String,
-    /// Noise seed; None: drawn.
-    pub seed: Option<u64>,
-    /// Overrides.
-    pub options: OptionsPatch,
-    /// Idle time to live; None: the configured one.
-    pub ttl_ms: Option<u64>,
-}
-
-/// Act.
-#[derive(Clone, Debug)]
-pub struct ActRequest {
-    /// Id of the session, as the client wrote it.
-    pub session_id: String,
-    /// Committed step + 1, or the committed step again.
-    pub step: u64,
-    /// What was seen.
-    pub observation: Observation,
-    /// Time it may take; None: the configured one.
-    pub deadline: Option<Duration>,
-    /// Whether the client wants the planned states with the answer.
-    pub want_planned_states: bool,
-    /// Which face it came through.
-    pub face: Face,
-}
-
-/// An answered act.
-#[derive(Clone, Debug)]
-pub struct Acted {
-    /// The committed answer.
-    pub answer: Arc<Answer>,
-    /// Whether an earlier or parallel call computed it.
-    pub replayed: bool,
-    /// Whether the client asked for the planned states.
-    pub want_planned_states: bool,
-}
-
-/// An answer of a batch or stream, with what it belongs to.
-#[derive(Debug)]
-pub struct ActResult {
-    /// As the client wrote it.
-    pub session_id: String,
-    /// As the client wrote it.
-    pub step: u64,
-    /// The answer or the error.
-    pub result: Result<Acted, ServiceError>,
-}
-
-/// ListSessions.
-#[derive(Clone, Debug, Default)]
-pub struct ListRequest {
-    /// 0: the default.
-    pub page_size: usize,
-    /// Id of the last session of the page before; empty: from the beginning.
-    pub page_token: String,
-    /// Only of this model; empty: all.
-    pub model: String,
-}
-
-/// A page of sessions.
-#[derive(Debug)]
-pub struct Page {
-    /// In order of id.
-    pub sessions: Vec<Summary>,
-    /// Empty on the last page.
-    pub next_page_token: String,
-}
 
 /// The service: models, sessions and the engine between them.
 pub struct Service {
@@ -271,7 +152,7 @@ impl Service {
     ///
     /// # Errors
     /// `TooLarge` if there are too many.
-    pub async fn act_batch(&self, acts: Vec<ActRequest>) -> Result<Vec<ActResult>, ServiceError> {
+    pub async fn act_batch(&self, acts: Vec<Result<ActRequest, ActResult>>) -> Result<Vec<ActResult>, ServiceError> {
         let limit = self.config.limits.act_batch_len_max;
         if acts.len() > limit {
             metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
@@ -281,33 +162,26 @@ impl Service {
     }
 
     /// ActStream: answers as they are ready, at most `limits.stream_acts_max` in work; ends when the acts end, or draining begins and the last one is
-    /// answered. An act that could not be read (`Err`) is answered with its error.
-    pub fn act_stream(self: Arc<Self>, acts: impl Stream<Item = Result<ActRequest, ServiceError>>) -> impl Stream<Item = ActResult> {
+    /// answered. An act that could not be read (`Err`) is answered with its error, here as in a batch.
+    pub fn act_stream(self: Arc<Self>, acts: impl Stream<Item = Result<ActRequest, ActResult>>) -> impl Stream<Item = ActResult> {
         let width = self.config.limits.stream_acts_max;
         let draining = self.draining.clone().cancelled_owned();
-        acts.take_until(draining)
-            .map(move |act| {
-                let service = self.clone();
-                async move {
-                    match act {
-                        Ok(act) => service.act_result(act).await,
-                        Err(error) => ActResult { session_id: String::new(), step: 0, result: Err(error) },
-                    }
-                }
-            })
-            .buffer_unordered(width)
+        let answer = move |act| {
+            let service = self.clone();
+            async move { service.act_result(act).await }
+        };
+        acts.take_until(draining).map(answer).buffer_unordered(width)
     }
 
     /// ResetSession.
     ///
     /// # Errors
     /// `SessionNotFound` and its kin, `SessionBusy`, `Draining`.
-    pub fn reset(&self, session_id: &str, seed: Option<u64>) -> Result<Summary, ServiceError> {
+    pub fn reset(&self, session_id: &str, seed: Option<u64>, keep_history: bool) -> Result<Summary, ServiceError> {
         self.registry()?;
         let session = self.session(session_id)?;
-        let episode = session.agent.open(seed.unwrap_or_else(draw_seed), &session.options).map_err(ServiceError::from_agent)?;
         let now = Instant::now();
-        session.reset(episode, now)?;
+        session.reset(|episode: &Episode| session.agent.reset(episode, seed.unwrap_or_else(draw_seed), keep_history), now)?;
         Ok(session.summary(now))
     }
 
@@ -346,9 +220,14 @@ impl Service {
         self.sessions.close(parse_id(session_id)?, Instant::now())
     }
 
-    async fn act_result(&self, act: ActRequest) -> ActResult {
-        let (session_id, step) = (act.session_id.clone(), act.step);
-        ActResult { session_id, step, result: self.act(act).await }
+    async fn act_result(&self, act: Result<ActRequest, ActResult>) -> ActResult {
+        match act {
+            Ok(act) => {
+                let (session_id, step) = (act.session_id.clone(), act.step);
+                ActResult { session_id, step, result: self.act(act).await }
+            }
+            Err(misread) => misread,
+        }
     }
 
     async fn act_on(&self, session: &Arc<Session>, request: ActRequest, arrived: Instant) -> Result<Acted, ServiceError> {
@@ -370,17 +249,21 @@ impl Service {
                 (waiter, true)
             }
             Entry::Lead(waiter, episode) => {
-                let seat = Seat { session: session.clone(), flight: waiter.flight().clone() };
-                let job = Job { agent: session.agent.clone(), episode, observation, ticket: seat, submitted: Instant::now() };
-                self.submit(job);
+                self.submit(Seat { session: session.clone(), flight: waiter.flight().clone() }, Question { episode, observation });
                 (waiter, false)
             }
         };
         wait(&waiter, arrived + patience).await.map(|answer| acted(answer, replayed))
     }
 
-    /// Hands the act to the engine; a refusal goes to everyone who waits for it.
-    fn submit(&self, job: Job<Seat>) {
+    /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
+    fn submit(&self, seat: Seat, question: Question) {
+        let agent = seat.session.agent.clone();
+        let descent = match question.begin(&agent) {
+            Ok(descent) => descent,
+            Err(error) => return seat.session.fail(&seat.flight, ServiceError::from_agent(error)),
+        };
+        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now() };
         let Err((refusal, job)) = self.engine.submit(job) else { return };
         let error = match refusal {
             Refusal::Full => {
@@ -411,42 +294,6 @@ impl Service {
             return Err(ServiceError::invalid(Part::Request, "ttl_ms", format!("must be 1 to {}", config.ttl_ms_max)));
         }
         Ok(Duration::from_millis(ttl_ms))
-    }
-}
-
-/// The engine's ticket: it brings the outcome home to the session.
-pub struct Seat {
-    session: Arc<Session>,
-    flight: Arc<Flight>,
-}
-
-impl Ticket for Seat {
-    fn is_wanted(&self) -> bool {
-        self.flight.is_wanted()
-    }
-
-    fn start(&self) {
-        self.flight.start();
-    }
-
-    fn settle(self, outcome: Result<Finished, Failure>) {
-        let Self { session, flight } = self;
-        match outcome {
-            Ok(Finished { episode, chunk, queue, compute, at }) => {
-                let now = Instant::now();
-                let timings = Timings { queue, compute, commit: now - at, total: now - flight.arrived };
-                let (model, model_digest) = (session.model.clone(), session.agent.spec().digest.clone());
-                let answer = Answer { session: session.id, step: flight.step, chunk, timings, model, model_digest };
-                session.commit(&flight, episode, answer);
-            }
-            Err(Failure::Agent(error)) => session.fail(&flight, ServiceError::from_agent(error)),
-            Err(Failure::Panic) => {
-                let id = Uuid::new_v4();
-                tracing::error!(%id, model = %session.model, step = flight.step, "the model panicked over an act");
-                session.fail(&flight, ServiceError::EnginePanic { id });
-            }
-            Err(Failure::Stopped) => session.fail(&flight, ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS }),
-        }
     }
 }
 

@@ -7,7 +7,7 @@ mod queue;
 mod tick;
 mod worker;
 
-use crate::model::agent::{Agent, AgentError, Chunk, Episode, Observation};
+use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode, Observation};
 use parking_lot::Mutex;
 use queue::Queue;
 use std::{
@@ -31,14 +31,32 @@ pub trait Ticket: Send + 'static {
     fn settle(self, outcome: Result<Finished, Failure>);
 }
 
-/// An act to compute.
-pub struct Job<T> {
-    /// The model.
-    pub agent: Arc<Agent>,
+/// What an act is computed from.
+pub struct Question {
     /// The episode it goes on from; it is not changed.
     pub episode: Arc<Episode>,
     /// What was seen.
     pub observation: Observation,
+}
+
+impl Question {
+    /// See [`Agent::begin`].
+    ///
+    /// # Errors
+    /// If the observation does not fit the model.
+    pub fn begin(&self, agent: &Agent) -> Result<Descent, AgentError> {
+        agent.begin(&self.episode, &self.observation)
+    }
+}
+
+/// An act to compute.
+pub struct Job<T> {
+    /// The model.
+    pub agent: Arc<Agent>,
+    /// To begin again, should the batch fail.
+    pub question: Question,
+    /// The act, begun.
+    pub descent: Descent,
     /// Who waits.
     pub ticket: T,
     /// When it was submitted.

@@ -1,6 +1,6 @@
 //! A worker's batch and its tick: one network evaluation shared by all acts that use the same model.
 
-use super::{Failure, Finished, Job, Ticket};
+use super::{Failure, Finished, Job, Question, Ticket};
 use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode};
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -21,7 +21,9 @@ struct Group<T> {
 }
 
 struct Rider<T> {
-    job: Job<T>,
+    question: Question,
+    ticket: T,
+    submitted: Instant,
     started: Instant,
     /// Evaluations spent on it, to count what is wasted if it is dropped.
     evaluations: u64,
@@ -39,22 +41,16 @@ impl<T: Ticket> Batch<T> {
         self.groups.iter().map(|group| group.riders.len()).sum()
     }
 
-    /// Starts an act; it takes part from the next tick on.
+    /// Takes an act in; it takes part from the next tick on.
     pub fn admit(&mut self, job: Job<T>) {
-        if !job.ticket.is_wanted() {
+        let Job { agent, question, descent, ticket, submitted } = job;
+        if !ticket.is_wanted() {
             return;
         }
-        job.ticket.start();
-        let started = Instant::now();
-        match guarded(|| job.agent.begin(&job.episode, &job.observation)) {
-            Ok(descent) => {
-                let agent = job.agent.clone();
-                let group = self.group(agent);
-                group.descents.push(descent);
-                group.riders.push(Rider { job, started, evaluations: 0 });
-            }
-            Err(failure) => job.ticket.settle(Err(failure)),
-        }
+        ticket.start();
+        let group = self.group(agent);
+        group.descents.push(descent);
+        group.riders.push(Rider { question, ticket, submitted, started: Instant::now(), evaluations: 0 });
     }
 
     /// One evaluation for every act; those that are done leave.
@@ -67,7 +63,7 @@ impl<T: Ticket> Batch<T> {
 
     /// Whoever is left at the end.
     pub fn into_tickets(self) -> impl Iterator<Item = T> {
-        self.groups.into_iter().flat_map(|group| group.riders).map(|rider| rider.job.ticket)
+        self.groups.into_iter().flat_map(|group| group.riders).map(|rider| rider.ticket)
     }
 
     fn group(&mut self, agent: Arc<Agent>) -> &mut Group<T> {
@@ -93,7 +89,7 @@ impl<T: Ticket> Group<T> {
             // Whose fault it was is unknown, and the descents may be half advanced: each act starts again, alone.
             self.descents.clear();
             for rider in self.riders.drain(..) {
-                rider.ride_alone();
+                rider.ride_alone(&self.agent);
             }
             return;
         }
@@ -105,7 +101,7 @@ impl<T: Ticket> Group<T> {
 
     fn drop_unwanted(&mut self) {
         for i in (0..self.riders.len()).rev() {
-            if !self.riders[i].job.ticket.is_wanted() {
+            if !self.riders[i].ticket.is_wanted() {
                 self.descents.swap_remove(i);
                 self.riders.swap_remove(i).count_waste();
             }
@@ -125,29 +121,27 @@ impl<T: Ticket> Group<T> {
 
 impl<T: Ticket> Rider<T> {
     /// The whole act without batch mates, from the beginning: the result is the same, for noise does not depend on the batch.
-    fn ride_alone(mut self) {
-        let agent = self.job.agent.clone();
-        let mut descent = match guarded(|| agent.begin(&self.job.episode, &self.job.observation)) {
+    fn ride_alone(mut self, agent: &Agent) {
+        let mut descent = match guarded(|| self.question.begin(agent)) {
             Ok(descent) => descent,
-            Err(failure) => return self.job.ticket.settle(Err(failure)),
+            Err(failure) => return self.ticket.settle(Err(failure)),
         };
         while !descent.is_done() {
-            if !self.job.ticket.is_wanted() {
+            if !self.ticket.is_wanted() {
                 return self.count_waste();
             }
             if let Err(failure) = guarded(|| agent.advance(std::slice::from_mut(&mut descent))) {
-                return self.job.ticket.settle(Err(failure));
+                return self.ticket.settle(Err(failure));
             }
             self.evaluations += 1;
         }
-        let finished = guarded(|| agent.finish(descent));
-        self.settle(finished);
+        self.settle(guarded(|| agent.finish(descent)));
     }
 
     fn settle(self, finished: Result<(Episode, Chunk), Failure>) {
-        let (at, queue) = (Instant::now(), self.started - self.job.submitted);
+        let (at, queue) = (Instant::now(), self.started - self.submitted);
         let compute = at - self.started;
-        self.job.ticket.settle(finished.map(|(episode, chunk)| Finished { episode, chunk, queue, compute, at }));
+        self.ticket.settle(finished.map(|(episode, chunk)| Finished { episode, chunk, queue, compute, at }));
     }
 
     fn count_waste(self) {

@@ -213,11 +213,11 @@ impl Session {
         flight.settle(Err(error));
     }
 
-    /// A new episode.
+    /// A new episode, made from the old one.
     ///
     /// # Errors
     /// While an act is in flight, or after the end.
-    pub fn reset(&self, episode: Episode, now: Instant) -> Result<(), ServiceError> {
+    pub fn reset(&self, renew: impl FnOnce(&Episode) -> Episode, now: Instant) -> Result<(), ServiceError> {
         let mut slot = self.slot.lock();
         if slot.ended {
             return Err(ServiceError::SessionNotFound);
@@ -225,6 +225,7 @@ impl Session {
         if slot.flight.as_ref().is_some_and(|flight| flight.is_wanted()) {
             return Err(ServiceError::SessionBusy { committed: slot.committed.step });
         }
+        let episode = renew(&slot.committed.episode);
         self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
         slot.flight = None;
         slot.resets += 1;
