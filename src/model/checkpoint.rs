@@ -227,3 +227,7 @@ fn io(path: &Path, source: std::io::Error) -> CheckpointError {
 fn invalid(path: &Path, reason: impl Into<String>) -> CheckpointError {
     CheckpointError::Invalid { path: path.display().to_string(), reason: reason.into() }
 }
+
+#[cfg(test)]
+#[path = "checkpoint_tests.rs"]
+mod tests;

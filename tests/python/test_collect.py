@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
+import sys
 
 import h5py
 import numpy as np
 import pytest
 
-from ada_diffuser import collect as cli
+from ada_diffuser.collect import Job, collect
+from ada_diffuser.commands.collect import main
 from ada_diffuser.dataset import card_path, load_episodes
 from ada_diffuser.experts import AnalyticPilot
 
@@ -17,7 +20,7 @@ TINY = ["--episodes", "3", "--quiet", "--expert-searches", "1", "--expert-iterat
 
 
 def run(out, *flags):
-    return cli.main(["--out", str(out), *TINY, *flags])
+    return main(["--out", str(out), *TINY, *flags])
 
 
 @pytest.mark.parametrize("name", ["point-wind-s", "cheetah-wind-s"])
@@ -47,8 +50,8 @@ def test_layout_is_d4rls(tmp_path):
 
 def test_rows_hold_the_step_as_it_was_executed():
     """Row t: the state before the step, the clipped noisy action, its reward, the wind that blew in it."""
-    job = cli.Job("point-wind-s", {"sigma": 0.0}, 2, (0.5,), seed=1)
-    episodes, failures = cli.collect(job, AnalyticPilot())
+    job = Job("point-wind-s", {"sigma": 0.0}, 2, (0.5,), seed=1)
+    episodes, failures = collect(job, AnalyticPilot())
     for start in (0, 200):
         rows = slice(start, start + 199)
         velocity = episodes.observations[rows, 2:]
@@ -102,7 +105,7 @@ def test_a_given_expert_flies_instead(tmp_path):
     [
         (["--env", "cheetah-rain"], "cheetah-wind-s"),
         (["--env", "point-wind-s", "--episodes", "0"], "--episodes"),
-        (["--env", "point-wind-s", "--option", "sigma"], "--option"),
+        (["--env", "point-wind-s", "--option", "sigma"], "NAME=VALUE"),
         (["--env", "point-wind-s", "--option", "sigmas=1"], "sigmas"),
         (["--env", "point-wind-s", "--action-noise", "a,b"], "--action-noise"),
         (["--env", "point-wind-s", "--action-noise=-1"], "--action-noise"),
@@ -111,7 +114,7 @@ def test_a_given_expert_flies_instead(tmp_path):
 )
 def test_wrong_arguments_are_named_and_write_nothing(flags, word, tmp_path, capsys):
     out = tmp_path / "x.h5"
-    assert cli.main(["--out", str(out), "--quiet", *flags]) == 2
+    assert main(["--out", str(out), "--quiet", *flags]) == 2
     assert word in capsys.readouterr().err
     assert not out.exists()
 
@@ -119,6 +122,24 @@ def test_wrong_arguments_are_named_and_write_nothing(flags, word, tmp_path, caps
 def test_the_output_must_be_hdf5(tmp_path, capsys):
     assert run(tmp_path / "x.csv", "--env", "point-wind-s") == 2
     assert "--out" in capsys.readouterr().err
+
+
+def test_an_environment_without_a_context_is_refused(tmp_path, capsys):
+    run(tmp_path / "x.h5", "--env", "cheetah-vel-e")
+    assert run(tmp_path / "y.h5", "--env", "Pendulum-v1", "--expert", str(tmp_path / "x.expert.npz")) == 2
+    assert "Pendulum-v1" in capsys.readouterr().err
+    assert run(tmp_path / "y.h5", "--env", "Pendulum-v1") == 2
+    assert "--expert" in capsys.readouterr().err
+
+
+def test_help_teaches_without_the_simulators():
+    """The extra is not needed to learn that it is."""
+    blocked = "import sys; sys.modules.update(dict.fromkeys(('gymnasium', 'mujoco', 'h5py', 'tqdm'))); "
+    code = blocked + "from ada_diffuser.commands.collect import main; sys.exit(main(sys.argv[1:]))"
+    told = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=True).stdout
+    assert all(word in told for word in ("--env", "infos/context", "examples:", "cheetah-vel-e"))
+    refused = subprocess.run([sys.executable, "-c", code, "--env", "point-wind-s", "--out", "x.h5"], capture_output=True, text=True)
+    assert refused.returncode == 2 and "[mujoco]" in refused.stderr
 
 
 def test_an_expert_of_another_shape_is_refused(tmp_path, capsys):

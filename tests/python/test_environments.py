@@ -6,6 +6,7 @@ import math
 import warnings
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -120,9 +121,9 @@ def test_point_wind_draws_wind_anew_in_each_episode():
 # ---- the cheetah's body ----
 
 
-def test_the_body_is_gymnasiums_half_cheetah():
-    import mujoco
-
+def test_the_body_is_gymnasiums_half_cheetah(tmp_path, monkeypatch):
+    """Also where this package loads the file in another way, because MuJoCo logs a deprecation into the working directory."""
+    monkeypatch.chdir(tmp_path)
     body, reference = HalfCheetahBody(), mujoco.MjModel.from_xml_path(str(XML))
     assert np.array_equal(body.model.body_mass, reference.body_mass)
     assert np.array_equal(body.model.dof_invweight0, reference.dof_invweight0)

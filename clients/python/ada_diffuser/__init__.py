@@ -1,3 +1,61 @@
-"""Python side of Ada-Diffuser: client, environments, data collection, evaluation."""
+"""Python side of Ada-Diffuser: client, environments, data collection, evaluation.
+
+`Client` and what it speaks of stand here; the rest is in the modules of those names and needs `ada-diffuser[mujoco]`.
+"""
+
+from ada_diffuser.broker import ChunkBroker
+from ada_diffuser.client import Client, Session
+from ada_diffuser.errors import (
+    AdaError,
+    Cancelled,
+    DeadlineExceeded,
+    InvalidInput,
+    NotFound,
+    Overloaded,
+    PayloadMismatch,
+    ServerFault,
+    SessionGone,
+    StepConflict,
+    TooLarge,
+    Unavailable,
+    UnexpectedAnswer,
+)
+from ada_diffuser.messages import (
+    Chunk,
+    Executed,
+    Model,
+    Observation,
+    SamplerOptions,
+    SessionSummary,
+    Timings,
+)
+from ada_diffuser.retry import RetryPolicy
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "AdaError",
+    "Cancelled",
+    "Chunk",
+    "ChunkBroker",
+    "Client",
+    "DeadlineExceeded",
+    "Executed",
+    "InvalidInput",
+    "Model",
+    "NotFound",
+    "Observation",
+    "Overloaded",
+    "PayloadMismatch",
+    "RetryPolicy",
+    "SamplerOptions",
+    "ServerFault",
+    "Session",
+    "SessionGone",
+    "SessionSummary",
+    "StepConflict",
+    "Timings",
+    "TooLarge",
+    "Unavailable",
+    "UnexpectedAnswer",
+]

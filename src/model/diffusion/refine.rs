@@ -229,3 +229,7 @@ fn loss_weights(layout: Layout, batch: &WindowBatch, options: &RefineOptions) ->
     }
     Tensor::from_vec(weights, (count, len, dim), &Device::Cpu)
 }
+
+#[cfg(test)]
+#[path = "refine_tests.rs"]
+mod tests;

@@ -101,3 +101,7 @@ impl LatentModel {
         kl / valid.sum_all()?
     }
 }
+
+#[cfg(test)]
+#[path = "elbo_tests.rs"]
+mod tests;

@@ -24,7 +24,7 @@ class ArsSettings:
         noise: standard deviation of a perturbation, nu.
     """
 
-    iterations: int = 250
+    iterations: int = 300
     directions: int = 8
     top: int = 4
     step: float = 0.02

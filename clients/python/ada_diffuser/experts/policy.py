@@ -16,6 +16,10 @@ class Expert(Protocol):
 
     card: dict[str, Any]
 
+    def sizes(self, context_size: int) -> tuple[int, int]:
+        """(observation size, action size) it is made for, in an environment with that context size."""
+        ...
+
     def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
         """Action for an observation and the context of the coming step; not clipped."""
         ...
@@ -26,6 +30,10 @@ class AnalyticPilot:
     """PointWind-S: proportional-derivative control that cancels the wind, `(-3 p - 2.5 v - w) / 4`."""
 
     card: dict[str, Any] = field(default_factory=lambda: {"kind": "analytic", "law": "clip((-3 p - 2.5 v - w_t u) / 4)"})
+
+    def sizes(self, context_size: int) -> tuple[int, int]:
+        """See `Expert.sizes`."""
+        return 4, 2
 
     def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
         """See `Expert.act`; observation (4,), context (2,), action (2,)."""
@@ -65,6 +73,11 @@ class PolicyBank:
     targets: np.ndarray | None
     card: dict[str, Any]
 
+    def sizes(self, context_size: int) -> tuple[int, int]:
+        """See `Expert.sizes`."""
+        actions, features = self.policies[0].weights.shape
+        return features - (context_size if self.targets is None else 0), actions
+
     def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
         """See `Expert.act`."""
         if self.targets is None:
@@ -93,7 +106,7 @@ def load_expert(path: Path) -> PolicyBank:
         with np.load(path, allow_pickle=False) as file:
             stacked = zip(file["weights"], file["mean"], file["std"], strict=True)
             policies = [LinearPolicy(*arrays) for arrays in stacked]
-            targets = file["targets"] if "targets" in file else None
+            targets = file.get("targets")
             return PolicyBank(policies, targets, json.loads(str(file["card"])))
     except (KeyError, ValueError, EOFError) as error:
         raise ValueError(f"{path} is not an expert written by ada-collect: {error}") from error

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -15,6 +17,7 @@ from .ars import ArsSettings, search
 from .policy import AnalyticPilot, Expert, LinearPolicy, PolicyBank
 
 PROCESSES_MAX = 2
+POLL_S = 0.5
 GAIN_SPREAD = 0.2
 JUDGE_EVERY = 5
 JUDGE_EPISODES = 9
@@ -70,18 +73,12 @@ def recipe_for(env: gym.Env, options: dict[str, Any], seed: int, seeds: int, ars
 def make_expert(recipe: ExpertRecipe | None, progress: Callable[[int, int], None] = lambda done, total: None) -> Expert:
     """Run the searches of a recipe, two at a time; without a recipe, the analytic pilot.
 
-    `progress(done, total)` is called as searches end. The result does not depend on the number of processes.
+    `progress(done, total)` is called now and then with iterations of all searches. The result does not depend on the number
+    of processes.
     """
     if recipe is None:
         return AnalyticPilot()
-    jobs = [(recipe, slot, number) for slot in range(max(1, len(recipe.targets))) for number in range(recipe.seeds)]
-    progress(0, len(jobs))
-    found = []
-    # Spawned, not forked: a fork would copy whatever threads the caller's libraries run.
-    with multiprocessing.get_context("spawn").Pool(min(PROCESSES_MAX, len(jobs))) as pool:
-        for result in pool.imap(_search_job, jobs):
-            found.append(result)
-            progress(len(found), len(jobs))
+    found = _run_searches(recipe, progress)
     slots = [found[i : i + recipe.seeds] for i in range(0, len(found), recipe.seeds)]
     best = [max(slot, key=lambda result: result[1]["fresh"]["mean"]) for slot in slots]
     targets = np.array(recipe.targets) if recipe.targets else None
@@ -94,73 +91,105 @@ def make_expert(recipe: ExpertRecipe | None, progress: Callable[[int, int], None
     return PolicyBank([policy for policy, _ in best], targets, card)
 
 
-def play(env: gym.Env, policy: LinearPolicy, seed: int, noise: float = 0.0, sees_context: bool = True) -> tuple[float, np.ndarray]:
-    """One episode on the bare environment; returns its return and the features visited (200, features)."""
-    rng = np.random.default_rng([seed, 1])
-    observation, _ = env.reset(seed=seed)
-    visited, total = [], 0.0
-    for _ in range(environments.EPISODE_STEPS):
-        features = np.concatenate([observation, env.context]) if sees_context else observation
-        action = policy.act(features)
-        if noise:
-            action = action + noise * rng.standard_normal(action.shape)
-        observation, reward, *_ = env.step(action)
-        visited.append(features)
-        total += reward
-    return total, np.array(visited, np.float64)
+def _run_searches(recipe: ExpertRecipe, progress: Callable[[int, int], None]) -> list[tuple[LinearPolicy, dict[str, Any]]]:
+    """All searches in order: those of the first policy, then those of the next."""
+    jobs = [(recipe, slot, number) for slot in range(max(1, len(recipe.targets))) for number in range(recipe.seeds)]
+    # Spawned, not forked: a fork would copy whatever threads the caller's libraries run.
+    context = multiprocessing.get_context("spawn")
+    done, total = context.Value("q", 0), len(jobs) * recipe.ars.iterations
+    with ProcessPoolExecutor(min(PROCESSES_MAX, len(jobs)), context, _start_worker, (done,)) as pool:
+        futures = [pool.submit(_search_job, *job) for job in jobs]
+        try:
+            while (state := wait(futures, POLL_S, FIRST_EXCEPTION)).not_done and not any(f.exception() for f in state.done):
+                progress(done.value, total)
+            return [future.result() for future in futures]
+        finally:
+            progress(done.value, total)
+            pool.shutdown(cancel_futures=True)
 
 
-def _search_job(job: tuple[ExpertRecipe, int, int]) -> tuple[LinearPolicy, dict[str, Any]]:
+_iterations_done: Any = None
+"""In a worker: the counter shared by all searches."""
+
+
+def _start_worker(done: Any) -> None:
+    global _iterations_done
+    _iterations_done = done
+    # An interrupt at the terminal reaches workers too: end at once and in silence, the parent says what there is to say.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+class _Course:
+    """The bare environment of one policy, held at one target where the policy is trained for one."""
+
+    def __init__(self, recipe: ExpertRecipe, slot: int) -> None:
+        held = {"targets": (recipe.targets[slot],)} if recipe.targets else {}
+        self.env = environments.make(recipe.env, **{**recipe.options, **held}).unwrapped
+        self.gain = getattr(self.env, "gain", None)
+        self.sees_context = not recipe.targets
+        context_size = len(self.env.context) if self.sees_context else 0
+        self.shape = (self.env.action_space.shape[0], self.env.observation_space.shape[0] + context_size)
+
+    def practise(self, policy: LinearPolicy, seed: int) -> tuple[float, np.ndarray]:
+        """An episode to learn from; the wind's gain varies, since a gait that knows one strength alone is fragile."""
+        if self.gain is not None:
+            self.env.gain = self.gain * np.random.default_rng([seed, 2]).uniform(1.0 - GAIN_SPREAD, 1.0 + GAIN_SPREAD)
+        return self._play(policy, seed, 0.0)
+
+    def judge(self, policy: LinearPolicy, seeds: np.ndarray, noises: tuple[float, ...]) -> np.ndarray:
+        """Returns (episodes,) in the environment as it is, under each action noise in turn."""
+        if self.gain is not None:
+            self.env.gain = self.gain
+        return np.array([self._play(policy, int(seed), noises[i % len(noises)])[0] for i, seed in enumerate(seeds)])
+
+    def summary(self, returns: np.ndarray) -> dict[str, Any]:
+        """What a card says of some episodes."""
+        return {
+            "episodes": len(returns),
+            "mean": round(float(returns.mean()), 3),
+            "median": round(float(np.median(returns)), 3),
+            "failures": int(sum(self.env.failed(r) for r in returns)),
+        }
+
+    def _play(self, policy: LinearPolicy, seed: int, noise: float) -> tuple[float, np.ndarray]:
+        """One episode: its return and the features visited (200, features)."""
+        rng = np.random.default_rng([seed, 1])
+        observation, _ = self.env.reset(seed=seed)
+        visited, total = [], 0.0
+        for _ in range(environments.EPISODE_STEPS):
+            features = np.concatenate([observation, self.env.context]) if self.sees_context else observation
+            action = policy.act(features)
+            if noise:
+                action = action + noise * rng.standard_normal(action.shape)
+            observation, reward, *_ = self.env.step(action)
+            visited.append(features)
+            total += reward
+        return total, np.array(visited, np.float64)
+
+
+def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> tuple[LinearPolicy, dict[str, Any]]:
     """One search: the best iterate on evaluation episodes, and what it reaches on fresh ones."""
-    recipe, slot, number = job
-    env, sees_context = _bare_env(recipe, slot)
-    train_rng, judge_rng, fresh_rng = (np.random.default_rng([recipe.seed, slot, number, part]) for part in range(3))
-    gain = getattr(env, "gain", None)
-
-    def rollout(policy: LinearPolicy, seed: int) -> tuple[float, np.ndarray]:
-        if gain is not None:
-            # A gait that only knows one strength of wind is a fragile one.
-            env.gain = gain * (1.0 + GAIN_SPREAD * (2.0 * (seed % 1024) / 1023.0 - 1.0))
-        return play(env, policy, seed, sees_context=sees_context)
-
-    def judge(policy: LinearPolicy, seeds: np.ndarray, noises: tuple[float, ...]) -> np.ndarray:
-        if gain is not None:
-            env.gain = gain
-        return np.array([play(env, policy, int(s), noises[i % len(noises)], sees_context)[0] for i, s in enumerate(seeds)])
-
+    course = _Course(recipe, slot)
+    search_rng, judge_rng, fresh_rng = (np.random.default_rng([recipe.seed, slot, number, part]) for part in range(3))
     judge_seeds = judge_rng.integers(2**31, size=JUDGE_EPISODES)
-    shape = (env.action_space.shape[0], env.observation_space.shape[0] + (1 if sees_context else 0))
     best, best_score, best_iteration = None, -np.inf, 0
-    for iteration, policy in enumerate(search(rollout, shape, recipe.ars, train_rng), start=1):
+    for iteration, policy in enumerate(search(course.practise, course.shape, recipe.ars, search_rng), start=1):
+        with _iterations_done.get_lock():
+            _iterations_done.value += 1
         if iteration % JUDGE_EVERY and iteration != recipe.ars.iterations:
             continue
-        score = float(judge(policy, judge_seeds, recipe.judge_noise).mean())
+        score = float(course.judge(policy, judge_seeds, recipe.judge_noise).mean())
         if score > best_score:
             best, best_score, best_iteration = policy, score, iteration
     if best is None:
-        raise ValueError("ars.iterations must be at least 1")
+        raise ValueError("a search needs at least one iteration and finite returns")
     fresh_seeds = fresh_rng.integers(2**31, size=FRESH_EPISODES)
     record = {
         "target": recipe.targets[slot] if recipe.targets else None,
         "search": number,
         "iteration": best_iteration,
         "judged": round(best_score, 3),
-        "fresh": _summary(env, judge(best, fresh_seeds, recipe.judge_noise)),
-        "fresh_without_noise": _summary(env, judge(best, fresh_seeds, (0.0,))),
+        "fresh": course.summary(course.judge(best, fresh_seeds, recipe.judge_noise)),
+        "fresh_without_noise": course.summary(course.judge(best, fresh_seeds, (0.0,))),
     }
     return best, record
-
-
-def _bare_env(recipe: ExpertRecipe, slot: int) -> tuple[gym.Env, bool]:
-    """The unwrapped environment of a policy, held at one target where it is trained for one."""
-    options = {**recipe.options, "targets": (recipe.targets[slot],)} if recipe.targets else recipe.options
-    return environments.make(recipe.env, **options).unwrapped, not recipe.targets
-
-
-def _summary(env: gym.Env, returns: np.ndarray) -> dict[str, Any]:
-    return {
-        "episodes": len(returns),
-        "mean": round(float(returns.mean()), 3),
-        "median": round(float(np.median(returns)), 3),
-        "failures": int(sum(env.failed(r) for r in returns)),
-    }

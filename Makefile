@@ -1,0 +1,65 @@
+# `make demo` and `make test` are all a newcomer needs; the rest is what they are made of.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+CARGO_FLAGS := --release --locked
+MODEL ?= cheetah-wind-s
+RECIPE ?= models/$(MODEL)/recipe.toml
+ENV ?= cheetah-wind-s
+EPISODES ?= 300
+DEMO_EPISODES ?= 8
+
+.PHONY: help demo serve collect train test test-rust test-python lint bench docs proto-python tools clean
+
+help: ## This list.
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 24
+
+tools: ## Checks that the tools are there, and says how to install what is missing.
+	@deploy/check-tools.sh $(PYTHON)
+
+demo: build venv ## Builds, serves the shipped model and lets HalfCheetah run in a wind it cannot see.
+	@DEMO_EPISODES=$(DEMO_EPISODES) deploy/demo.sh
+
+serve: build ## Serves models/ on loopback.
+	target/release/ada-server
+
+collect: venv ## Records rollouts: make collect ENV=point-wind-s EPISODES=400
+	$(BIN)/ada-collect --env $(ENV) --episodes $(EPISODES) --out data/$(ENV).h5
+
+train: build ## Trains a recipe: make train RECIPE=models/point-wind-s/recipe.toml
+	target/release/ada-trainer run $(RECIPE)
+
+test: test-rust test-python ## Every check there is.
+
+test-rust: tools
+	cargo test $(CARGO_FLAGS)
+
+test-python: build venv
+	$(BIN)/python -m pytest -q tests/python
+
+lint: venv ## Formatting, clippy, docs and ruff, all with warnings as errors.
+	cargo fmt --check
+	cargo clippy $(CARGO_FLAGS) --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc $(CARGO_FLAGS) --no-deps
+	$(BIN)/ruff check clients/python tests
+	$(BIN)/ruff format --check clients/python tests
+
+bench: ## Kernel, forward, act and training-step times of this machine.
+	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 cargo bench --locked
+
+proto-python: venv ## Writes the Python stubs anew from proto/.
+	$(BIN)/python -m grpc_tools.protoc -I proto --python_out=clients/python --grpc_python_out=clients/python --pyi_out=clients/python proto/ada_diffuser/v1/*.proto
+
+.PHONY: build venv
+build: tools
+	cargo build $(CARGO_FLAGS) --bins
+
+venv: $(VENV)/.ready
+$(VENV)/.ready: clients/python/requirements.lock clients/python/pyproject.toml | tools
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -r clients/python/requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -e clients/python
+	touch $@
+
+clean: ## Removes what was built.
+	rm -rf target $(VENV) out

@@ -1,0 +1,257 @@
+"""The client: sessions on a server, over gRPC or REST, with retries that cannot take a step twice.
+
+    with Client("grpc://127.0.0.1:7777") as client, client.open_session(seed=7) as session:
+        chunk = session.act(state)
+
+What is sent again: an act, a batch, a reset, a close or a question that failed as `Overloaded`, `DeadlineExceeded` or
+`Unavailable`, after a wait (`RetryPolicy`). An act is sent again with the same step and the same bytes, so the server either
+takes it once or answers as it did before (`Chunk.replayed`). If all attempts fail, the last error is raised and the
+session stands where it stood: call `act` with the same observation again, whenever you like.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ada_diffuser.errors import AdaError, InvalidInput, NotFound, StepConflict, Unavailable
+from ada_diffuser.faces import Face, connect
+from ada_diffuser.messages import (
+    ActCall,
+    Chunk,
+    Executed,
+    Model,
+    Observation,
+    SamplerOptions,
+    SessionSummary,
+    executed_values,
+    finite,
+)
+from ada_diffuser.retry import Backoff, RetryPolicy
+
+
+class Client:
+    """A server. Safe to use from many threads; a `Session` belongs to one thread at a time."""
+
+    def __init__(self, url: str, *, timeout_s: float = 30.0, retry: RetryPolicy | None = None) -> None:
+        """`url` is `grpc://host:port` or `http://host:port`; `timeout_s` bounds each attempt of each call."""
+        self.url = url
+        self._timeout_s = timeout_s
+        self._retry = retry or RetryPolicy()
+        self._face: Face = connect(url)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the connections. Sessions that are still open expire on the server."""
+        self._face.close()
+
+    def wait_ready(self, timeout_s: float = 60.0) -> None:
+        """Returns when the server answers with at least one model; Unavailable if it does not within `timeout_s`."""
+        end = time.monotonic() + timeout_s
+        while True:
+            try:
+                if self._face.models(min(self._timeout_s, 2.0)):
+                    return
+                last: AdaError = Unavailable(f"{self.url} has no model loaded")
+            except AdaError as error:
+                if not error.retryable:
+                    raise
+                last = error
+            if time.monotonic() > end:
+                raise last
+            time.sleep(0.1)
+
+    def models(self) -> list[Model]:
+        """All loaded models, by name."""
+        return self._retry.run(lambda: self._face.models(self._timeout_s))
+
+    def model(self, name: str = "") -> Model:
+        """One model, `name` or `name@digest`; empty: the default one."""
+        return self._retry.run(lambda: self._face.model(name, self._timeout_s))
+
+    def open_session(
+        self,
+        model: str = "",
+        *,
+        seed: int | None = None,
+        options: SamplerOptions | None = None,
+        ttl_ms: int | None = None,
+    ) -> Session:
+        """A session at committed step 0. Without `seed` the server draws one (`session.seed`).
+
+        If an answer is lost on the way, the retry opens a second session and the first one expires unused.
+        """
+        wanted = options or SamplerOptions()
+        summary, spec = self._retry.run(lambda: self._face.open_session(model, seed, wanted, ttl_ms, self._timeout_s))
+        return Session(self, self._face, summary, spec)
+
+    def attach(self, session_id: str) -> Session:
+        """A session that was opened elsewhere, or before this program was started again."""
+        summary = self.summary(session_id)
+        return Session(self, self._face, summary, self.model(f"{summary.model}@{summary.model_digest}"))
+
+    def summary(self, session_id: str) -> SessionSummary:
+        """The state of a session."""
+        return self._retry.run(lambda: self._face.get_session(session_id, self._timeout_s))
+
+    def sessions(self, model: str = "", page_size: int = 0) -> Iterator[SessionSummary]:
+        """All sessions, by id; page after page as they are consumed."""
+        token = ""
+        while True:
+            page, token = self._retry.run(
+                lambda token=token: self._face.list_sessions(model, page_size, token, self._timeout_s)  # type: ignore[misc]
+            )
+            yield from page
+            if not token:
+                return
+
+    def act_batch(
+        self, acts: Sequence[tuple[Session, Observation]], *, deadline_ms: int | None = None, planned_states: bool = False
+    ) -> list[Chunk | AdaError]:
+        """One act in each of many different sessions, in one call. Each has its own answer or error, in the order of `acts`.
+
+        Only the acts that failed in a retryable way are sent again. Raises what concerns the call as a whole.
+        """
+        if len({session.session_id for session, _ in acts}) != len(acts):
+            raise ValueError("a session stands twice in the batch: one act a session is in flight")
+        calls = [session.next_call(observation, deadline_ms, planned_states) for session, observation in acts]
+        results = self._batch_until_settled(calls)
+        for (session, _), result in zip(acts, results, strict=True):
+            if isinstance(result, Chunk):
+                session.commit(result)
+        return results
+
+    def _batch_until_settled(self, calls: Sequence[ActCall]) -> list[Chunk | AdaError]:
+        settled: dict[int, Chunk | AdaError] = {}
+        pending = list(range(len(calls)))
+        backoff = Backoff(self._retry)
+        while pending:
+            try:
+                results = self._face.act_batch([calls[i] for i in pending], self._timeout_s)
+            except AdaError as error:
+                if not error.retryable:
+                    raise
+                results = [error] * len(pending)
+            settled.update(zip(pending, results, strict=True))
+            failed = [(i, result) for i, result in settled.items() if isinstance(result, AdaError) and result.retryable]
+            pending = [i for i, _ in failed]
+            if pending and not backoff.wait(max(error.retry_after_ms or 0 for _, error in failed)):
+                break
+        return [settled[i] for i in range(len(calls))]
+
+    def _act(self, call: ActCall) -> Chunk:
+        return self._retry.run(lambda: self._face.act(call, self._timeout_s))
+
+    def _reset(self, session_id: str, seed: int | None) -> SessionSummary:
+        # An act that was given up here may still be in flight there, for a moment: worth the wait.
+        return self._retry.run(
+            lambda: self._face.reset_session(session_id, seed, self._timeout_s),
+            lambda error: error.retryable or isinstance(error, StepConflict),
+        )
+
+    def _close_session(self, session_id: str) -> None:
+        # Not found: a close whose answer was lost, or the session expired. It is closed either way.
+        with suppress(NotFound):
+            self._retry.run(lambda: self._face.close_session(session_id, self._timeout_s))
+
+
+class Session:
+    """One episode after the other, on one model. A context manager that closes the session."""
+
+    def __init__(self, client: Client, face: Face, summary: SessionSummary, model: Model) -> None:
+        """Made by `Client.open_session` and `Client.attach`."""
+        self._client = client
+        self.session_id = summary.session_id
+        #: The model: dimensions, horizons, bounds of the actions.
+        self.model = model
+        #: Sampling options in force.
+        self.options = summary.options
+        #: Seed of the running episode.
+        self.seed = summary.seed
+        self._committed_step = summary.committed_step
+        self._closed = False
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            self.close()
+        except AdaError:
+            if error is None:
+                raise
+
+    @property
+    def committed_step(self) -> int:
+        """Acts of the running episode that this client has the answer of."""
+        return self._committed_step
+
+    def act(
+        self,
+        state: ArrayLike,
+        executed: Sequence[Executed] = (),
+        *,
+        reward: float | Sequence[float] | None = None,
+        deadline_ms: int | None = None,
+        planned_states: bool = False,
+    ) -> Chunk:
+        """One observation in, one chunk of actions out.
+
+        `state` is the current state, `(state_dim,)`. `executed` says what was executed since the last act; empty means the
+        whole last chunk. `reward` is short for it when only rewards are to be told: one for each step executed since.
+        """
+        if reward is not None:
+            if executed:
+                raise ValueError("rewards stand in `executed` when it is given")
+            executed = [Executed(reward=float(value)) for value in np.atleast_1d(np.asarray(reward, dtype=float))]
+        call = self.next_call(Observation(state, executed), deadline_ms, planned_states)
+        chunk = self._client._act(call)
+        self.commit(chunk)
+        return chunk
+
+    def next_call(self, observation: Observation, deadline_ms: int | None = None, planned_states: bool = False) -> ActCall:
+        """The act that comes next, as it is sent, each time it is sent."""
+        return ActCall(
+            session_id=self.session_id,
+            step=self._committed_step + 1,
+            state=finite(observation.state, "observation.state"),
+            executed=executed_values(observation.executed),
+            deadline_ms=deadline_ms,
+            want_planned_states=planned_states,
+        )
+
+    def commit(self, chunk: Chunk) -> None:
+        """Notes that the answer of the next act has arrived."""
+        if chunk.session_id != self.session_id or chunk.step != self._committed_step + 1:
+            raise InvalidInput(f"step {chunk.step} of {chunk.session_id} is not the next of {self.session_id}")
+        self._committed_step = chunk.step
+
+    def reset(self, seed: int | None = None) -> None:
+        """A new episode: committed step 0 again. Without `seed` the server draws one."""
+        summary = self._client._reset(self.session_id, seed)
+        self.seed, self._committed_step = summary.seed, summary.committed_step
+
+    def summary(self) -> SessionSummary:
+        """The state of the session on the server."""
+        return self._client.summary(self.session_id)
+
+    def catch_up(self) -> int:
+        """Takes over the server's committed step, after a `StepConflict` or `PayloadMismatch`; returns it."""
+        self._committed_step = self.summary().committed_step
+        return self._committed_step
+
+    def close(self) -> None:
+        """Ends the session on the server; a second close does nothing."""
+        if not self._closed:
+            self._client._close_session(self.session_id)
+            self._closed = True

@@ -1,0 +1,182 @@
+"""What can go wrong, one class for each thing a caller can do about it.
+
+The server names every failure by a fixed word, the *reason* (table in `clients/http/README.md`). Both faces carry it, and
+`from_detail` is the only place where it becomes a class. A failure without a reason (no connection, a proxy in between)
+becomes the class of its gRPC code or HTTP status.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Detail:
+    """What an answer says about a failure, the same from both faces."""
+
+    message: str
+    #: Fixed word to act on; empty when the server did not write this answer.
+    reason: str = ""
+    #: Path of the offending field, e.g. `observation.executed[2].action`.
+    field: str = ""
+    committed_step: int | None = None
+    retry_after_ms: int | None = None
+    #: With internal errors: find it in the server's log.
+    error_id: str = ""
+
+
+class AdaError(Exception):
+    """Base of all errors of this package; the fields are those of `Detail`."""
+
+    #: Whether the same request may succeed if it is sent again, unchanged.
+    retryable = False
+
+    def __init__(self, detail: Detail | str) -> None:
+        self.detail = Detail(detail) if isinstance(detail, str) else detail
+        super().__init__(str(self))
+
+    @property
+    def reason(self) -> str:
+        return self.detail.reason
+
+    @property
+    def message(self) -> str:
+        return self.detail.message
+
+    @property
+    def field(self) -> str:
+        return self.detail.field
+
+    @property
+    def committed_step(self) -> int | None:
+        return self.detail.committed_step
+
+    @property
+    def retry_after_ms(self) -> int | None:
+        return self.detail.retry_after_ms
+
+    @property
+    def error_id(self) -> str:
+        return self.detail.error_id
+
+    def __str__(self) -> str:
+        parts = [self.reason, self.field, self.message, f"error id {self.error_id}" if self.error_id else ""]
+        return ": ".join(part for part in parts if part)
+
+    def __reduce__(self) -> tuple[type[AdaError], tuple[Detail]]:
+        return type(self), (self.detail,)
+
+
+class InvalidInput(AdaError):
+    """Correct `field` and send again. OBSERVATION_INVALID, REQUEST_INVALID, OPTIONS_INVALID."""
+
+
+class TooLarge(AdaError):
+    """Send less. TOO_LARGE."""
+
+
+class NotFound(AdaError):
+    """No such session or model. SESSION_NOT_FOUND, MODEL_NOT_FOUND."""
+
+
+class SessionGone(NotFound):
+    """The session expired or made room for others: open a new one. SESSION_EXPIRED, SESSION_EVICTED."""
+
+
+class StepConflict(AdaError):
+    """Somebody else moved the session: go on from `committed_step`. STEP_OUT_OF_ORDER, SESSION_BUSY."""
+
+
+class PayloadMismatch(AdaError):
+    """This step was taken with another observation. STEP_PAYLOAD_MISMATCH."""
+
+
+class Overloaded(AdaError):
+    """The same again after `retry_after_ms`. QUEUE_FULL, QUOTA."""
+
+    retryable = True
+
+
+class DeadlineExceeded(AdaError):
+    """The same again: nothing was changed, or the answer waits for the retry. DEADLINE_*, or this client's timeout."""
+
+    retryable = True
+
+
+class Unavailable(AdaError):
+    """The same again after `retry_after_ms`: no connection, or DRAINING, NOT_READY."""
+
+    retryable = True
+
+
+class Cancelled(AdaError):
+    """The session was closed under the act. CANCELLED."""
+
+
+class ServerFault(AdaError):
+    """Report `error_id`: nothing was changed. NONFINITE_OUTPUT, ENGINE_PANIC, INTERNAL."""
+
+
+class UnexpectedAnswer(AdaError):
+    """The answer is none that this server gives: wrong address, or a version that this client does not know."""
+
+
+_BY_REASON: dict[str, type[AdaError]] = {
+    "OBSERVATION_INVALID": InvalidInput,
+    "REQUEST_INVALID": InvalidInput,
+    "OPTIONS_INVALID": InvalidInput,
+    "TOO_LARGE": TooLarge,
+    "SESSION_NOT_FOUND": NotFound,
+    "MODEL_NOT_FOUND": NotFound,
+    "SESSION_EXPIRED": SessionGone,
+    "SESSION_EVICTED": SessionGone,
+    "STEP_OUT_OF_ORDER": StepConflict,
+    "SESSION_BUSY": StepConflict,
+    "STEP_PAYLOAD_MISMATCH": PayloadMismatch,
+    "QUEUE_FULL": Overloaded,
+    "QUOTA": Overloaded,
+    "DEADLINE_ADMISSION": DeadlineExceeded,
+    "DEADLINE_QUEUE": DeadlineExceeded,
+    "DEADLINE_COMPUTE": DeadlineExceeded,
+    "CANCELLED": Cancelled,
+    "DRAINING": Unavailable,
+    "NOT_READY": Unavailable,
+    "NONFINITE_OUTPUT": ServerFault,
+    "ENGINE_PANIC": ServerFault,
+    "INTERNAL": ServerFault,
+}
+
+_BY_GRPC_CODE: dict[int, type[AdaError]] = {
+    1: Cancelled,
+    3: InvalidInput,
+    4: DeadlineExceeded,
+    5: NotFound,
+    8: Overloaded,
+    9: PayloadMismatch,
+    10: StepConflict,
+    13: ServerFault,
+    14: Unavailable,
+}
+
+_BY_HTTP_STATUS: dict[int, type[AdaError]] = {
+    400: InvalidInput,
+    404: NotFound,
+    408: DeadlineExceeded,
+    410: SessionGone,
+    413: TooLarge,
+    429: Overloaded,
+    500: ServerFault,
+    502: Unavailable,
+    503: Unavailable,
+    504: DeadlineExceeded,
+}
+
+
+def from_detail(detail: Detail, *, grpc_code: int | None = None, http_status: int | None = None) -> AdaError:
+    """The error of a failed call: by its reason, else by its code or status."""
+    kind = _BY_REASON.get(detail.reason)
+    if kind is None and grpc_code is not None:
+        kind = _BY_GRPC_CODE.get(grpc_code)
+    if kind is None and http_status is not None:
+        kind = _BY_HTTP_STATUS.get(http_status)
+    return (kind or UnexpectedAnswer)(detail)

@@ -1,0 +1,55 @@
+"""The two faces of the server, behind one protocol: every verb once, plain data in and out, `AdaError` on failure.
+
+A face makes exactly one attempt a call; retrying is the client's business.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+from urllib.parse import urlsplit
+
+from ada_diffuser.errors import AdaError
+from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary
+
+
+class Face(Protocol):
+    """The verbs. `timeout_s` bounds each call on this side."""
+
+    def open_session(
+        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, timeout_s: float
+    ) -> tuple[SessionSummary, Model]: ...
+
+    def act(self, call: ActCall, timeout_s: float) -> Chunk: ...
+
+    def act_batch(self, calls: Sequence[ActCall], timeout_s: float) -> list[Chunk | AdaError]: ...
+
+    def reset_session(self, session_id: str, seed: int | None, timeout_s: float) -> SessionSummary: ...
+
+    def get_session(self, session_id: str, timeout_s: float) -> SessionSummary: ...
+
+    def list_sessions(self, model: str, page_size: int, page_token: str, timeout_s: float) -> tuple[list[SessionSummary], str]: ...
+
+    def close_session(self, session_id: str, timeout_s: float) -> None: ...
+
+    def models(self, timeout_s: float) -> list[Model]: ...
+
+    def model(self, name: str, timeout_s: float) -> Model: ...
+
+    def close(self) -> None: ...
+
+
+def connect(url: str) -> Face:
+    """The face that `url` names: `grpc://host:port` or `http://host:port`. No byte is sent yet."""
+    parts = urlsplit(url)
+    if parts.scheme not in ("grpc", "http") or not parts.hostname or parts.port is None:
+        raise ValueError(f"{url!r} is neither grpc://host:port nor http://host:port")
+    if parts.path.strip("/") or parts.query or parts.fragment:
+        raise ValueError(f"{url!r} has more than a host and a port")
+    if parts.scheme == "grpc":
+        from ada_diffuser.faces.grpc_face import GrpcFace
+
+        return GrpcFace(parts.netloc)
+    from ada_diffuser.faces.http_face import HttpFace
+
+    return HttpFace(parts.hostname, parts.port)

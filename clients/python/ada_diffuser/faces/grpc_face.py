@@ -1,0 +1,229 @@
+"""The gRPC face: generated stubs <-> plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import grpc
+import numpy as np
+
+from ada_diffuser.errors import AdaError, Detail, UnexpectedAnswer, from_detail
+from ada_diffuser.messages import ActCall, Chunk, Floats, Model, SamplerOptions, SessionSummary, Start, Timings
+from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
+
+#: gRPC must not retry by itself (the client does), and must find a restarted server again within seconds.
+_CHANNEL_OPTIONS = [
+    ("grpc.enable_retries", 0),
+    ("grpc.max_receive_message_length", 64 << 20),
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.min_reconnect_backoff_ms", 100),
+    ("grpc.max_reconnect_backoff_ms", 2000),
+]
+
+_STARTS: dict[int, Start] = {
+    agent_pb2.START_COLD: "cold",
+    agent_pb2.START_WARM: "warm",
+    agent_pb2.START_RENOISED: "renoised",
+}
+
+
+class GrpcFace:
+    """One channel; safe to use from many threads."""
+
+    def __init__(self, target: str) -> None:
+        self._channel = grpc.insecure_channel(target, options=_CHANNEL_OPTIONS)
+        self._agent = agent_pb2_grpc.AgentStub(self._channel)  # type: ignore[no-untyped-call]
+        self._models = models_pb2_grpc.ModelsStub(self._channel)  # type: ignore[no-untyped-call]
+
+    def open_session(
+        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, timeout_s: float
+    ) -> tuple[SessionSummary, Model]:
+        request = agent_pb2.OpenSessionRequest(
+            model=model, seed=_uint64(seed, "seed"), options=_options_out(options), ttl_ms=_uint64(ttl_ms, "ttl_ms")
+        )
+        answer = _call(self._agent.OpenSession, request, timeout_s)
+        return _summary(answer.session), _model(answer.model)
+
+    def act(self, call: ActCall, timeout_s: float) -> Chunk:
+        return _chunk(_call(self._agent.Act, _act_request(call), timeout_s))
+
+    def act_batch(self, calls: Sequence[ActCall], timeout_s: float) -> list[Chunk | AdaError]:
+        request = agent_pb2.ActBatchRequest(acts=[_act_request(call) for call in calls])
+        return [_result(result) for result in _call(self._agent.ActBatch, request, timeout_s).results]
+
+    def reset_session(self, session_id: str, seed: int | None, timeout_s: float) -> SessionSummary:
+        request = agent_pb2.ResetSessionRequest(session_id=session_id, seed=_uint64(seed, "seed"))
+        return _summary(_call(self._agent.ResetSession, request, timeout_s).session)
+
+    def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:
+        request = agent_pb2.GetSessionRequest(session_id=session_id)
+        return _summary(_call(self._agent.GetSession, request, timeout_s).session)
+
+    def list_sessions(self, model: str, page_size: int, page_token: str, timeout_s: float) -> tuple[list[SessionSummary], str]:
+        request = agent_pb2.ListSessionsRequest(model=model, page_size=page_size, page_token=page_token)
+        answer = _call(self._agent.ListSessions, request, timeout_s)
+        return [_summary(session) for session in answer.sessions], answer.next_page_token
+
+    def close_session(self, session_id: str, timeout_s: float) -> None:
+        _call(self._agent.CloseSession, agent_pb2.CloseSessionRequest(session_id=session_id), timeout_s)
+
+    def models(self, timeout_s: float) -> list[Model]:
+        answer = _call(self._models.List, models_pb2.ListModelsRequest(), timeout_s)
+        return [_model(model) for model in answer.models]
+
+    def model(self, name: str, timeout_s: float) -> Model:
+        return _model(_call(self._models.Get, models_pb2.GetModelRequest(model=name), timeout_s).model)
+
+    def close(self) -> None:
+        self._channel.close()
+
+
+def _call(verb: Callable[..., Any], request: Any, timeout_s: float) -> Any:
+    try:
+        return verb(request, timeout=timeout_s)
+    except grpc.RpcError as error:
+        raise _error_of_call(error) from None
+    except ValueError as error:  # the channel was closed
+        raise UnexpectedAnswer(str(error)) from None
+
+
+def _error_of_call(error: grpc.RpcError) -> AdaError:
+    call = cast(grpc.Call, error)
+    trailers = {key: value for key, value in call.trailing_metadata() or () if isinstance(value, str)}
+    detail = Detail(
+        message=call.details() or "",
+        reason=trailers.get("ada-reason", ""),
+        field=trailers.get("ada-field", ""),
+        committed_step=_number(trailers.get("ada-committed-step")),
+        retry_after_ms=_number(trailers.get("grpc-retry-pushback-ms")),
+        error_id=trailers.get("ada-error-id", ""),
+    )
+    return from_detail(detail, grpc_code=call.code().value[0])
+
+
+def _number(word: str | None) -> int | None:
+    return int(word) if word is not None and word.isdigit() else None
+
+
+def _error_of_result(error: agent_pb2.Error) -> AdaError:
+    detail = Detail(
+        message=error.message,
+        reason=error.reason,
+        field=error.field,
+        committed_step=error.committed_step if error.HasField("committed_step") else None,
+        retry_after_ms=error.retry_after_ms if error.HasField("retry_after_ms") else None,
+        error_id=error.error_id,
+    )
+    return from_detail(detail, grpc_code=error.code)
+
+
+def _uint64(value: int | None, field: str) -> int | None:
+    if value is not None and not 0 <= value < 1 << 64:
+        raise ValueError(f"{field} = {value} is not in 0 .. 2^64 - 1")
+    return value
+
+
+def _act_request(call: ActCall) -> agent_pb2.ActRequest:
+    request = agent_pb2.ActRequest(session_id=call.session_id, step=call.step, want_planned_states=call.want_planned_states)
+    if call.deadline_ms is not None:
+        request.deadline_ms = call.deadline_ms
+    request.observation.state.extend(call.state.tolist())
+    for step in call.executed:
+        out = request.observation.executed.add()
+        if step.state is not None:
+            out.state.values.extend(step.state.tolist())
+        if step.action is not None:
+            out.action.values.extend(step.action.tolist())
+        if step.reward is not None:
+            out.reward = step.reward
+    return request
+
+
+def _options_out(options: SamplerOptions) -> models_pb2.SamplerOptions:
+    given = options.given()
+    if "latent" in given:
+        given["latent"] = f"LATENT_MODE_{given['latent'].upper()}"
+    return models_pb2.SamplerOptions(**given)
+
+
+def _options_in(options: models_pb2.SamplerOptions) -> SamplerOptions:
+    given: dict[str, Any] = {field.name: value for field, value in options.ListFields()}
+    if "latent" in given:
+        given["latent"] = "sample" if given["latent"] == models_pb2.LATENT_MODE_SAMPLE else "mean"
+    return SamplerOptions(**given)
+
+
+def _floats(values: Any) -> Floats:
+    return np.array(values, dtype=np.float32)
+
+
+def _matrix(matrix: agent_pb2.Matrix) -> Floats:
+    if len(matrix.values) != matrix.rows * matrix.columns:
+        raise UnexpectedAnswer(f"a matrix of {matrix.rows} x {matrix.columns} holds {len(matrix.values)} values")
+    return _floats(matrix.values).reshape(matrix.rows, matrix.columns)
+
+
+def _result(result: agent_pb2.ActResult) -> Chunk | AdaError:
+    if result.WhichOneof("result") == "response":
+        return _chunk(result.response)
+    return _error_of_result(result.error)
+
+
+def _chunk(answer: agent_pb2.ActResponse) -> Chunk:
+    timings = answer.timings
+    return Chunk(
+        session_id=answer.session_id,
+        step=answer.step,
+        replayed=answer.replayed,
+        actions=_matrix(answer.actions),
+        planned_states=_matrix(answer.planned_states) if answer.HasField("planned_states") else None,
+        latent_mean=_floats(answer.latent_mean),
+        latent_log_var=_floats(answer.latent_log_var),
+        predicted_state=_floats(answer.predicted_state),
+        evaluations=answer.evaluations,
+        start=_STARTS.get(answer.start, "cold"),
+        renoised_rungs=answer.renoised_rungs,
+        timings=Timings(timings.queue_us, timings.compute_us, timings.commit_us, timings.total_us),
+        model=answer.model,
+        model_digest=answer.model_digest,
+        degraded=answer.degraded,
+    )
+
+
+def _model(model: models_pb2.Model) -> Model:
+    return Model(
+        name=model.name,
+        digest=model.digest,
+        is_default=model.is_default,
+        state_dim=model.state_dim,
+        action_dim=model.action_dim,
+        plan_horizon=model.plan_horizon,
+        block_len=model.block_len,
+        obs_horizon=model.obs_horizon,
+        latent_dim=model.latent_dim,
+        level_max=model.level_max,
+        action_low=_floats(model.action_low),
+        action_high=_floats(model.action_high),
+        sampler=_options_in(model.sampler),
+        refined=model.refined,
+    )
+
+
+def _summary(session: agent_pb2.Session) -> SessionSummary:
+    return SessionSummary(
+        session_id=session.session_id,
+        model=session.model,
+        model_digest=session.model_digest,
+        seed=session.seed,
+        committed_step=session.committed_step,
+        episode=session.episode,
+        options=_options_in(session.options),
+        latent_mean=_floats(session.latent_mean),
+        latent_log_var=_floats(session.latent_log_var),
+        age_ms=session.age_ms,
+        idle_ms=session.idle_ms,
+        ttl_ms=session.ttl_ms,
+        state_bytes=session.state_bytes,
+        busy=session.busy,
+    )

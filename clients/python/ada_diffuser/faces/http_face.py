@@ -1,0 +1,268 @@
+"""The REST face: JSON <-> plain data, over kept-alive connections of the standard library."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import math
+import socket
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+from urllib.parse import quote, urlencode
+
+import numpy as np
+
+from ada_diffuser.errors import AdaError, DeadlineExceeded, Detail, Unavailable, UnexpectedAnswer, from_detail
+from ada_diffuser.messages import ActCall, Chunk, Floats, Model, SamplerOptions, SessionSummary, Timings
+
+T = TypeVar("T")
+
+
+class HttpFace:
+    """A pool of connections, one for each call under way; safe to use from many threads."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._host, self._port = host, port
+        self._idle: list[http.client.HTTPConnection] = []
+        self._lock = threading.Lock()
+
+    def open_session(
+        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, timeout_s: float
+    ) -> tuple[SessionSummary, Model]:
+        body = _without_none(model=model or None, seed=seed, options=_options_out(options) or None, ttl_ms=ttl_ms)
+        answer = self._call("POST", "/v1/sessions", body, timeout_s)
+        return _read(_summary, answer, "session"), _read(_model, answer, "model")
+
+    def act(self, call: ActCall, timeout_s: float) -> Chunk:
+        body = _act_body(call)
+        return _read(_chunk, self._call("POST", f"/v1/sessions/{_quoted(call.session_id)}/act", body, timeout_s))
+
+    def act_batch(self, calls: Sequence[ActCall], timeout_s: float) -> list[Chunk | AdaError]:
+        body = {"acts": [{"session_id": call.session_id, **_act_body(call)} for call in calls]}
+        return _read(_results, self._call("POST", "/v1/act:batch", body, timeout_s), "results")
+
+    def reset_session(self, session_id: str, seed: int | None, timeout_s: float) -> SessionSummary:
+        path = f"/v1/sessions/{_quoted(session_id)}/reset"
+        return _read(_summary, self._call("POST", path, _without_none(seed=seed), timeout_s), "session")
+
+    def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:
+        return _read(_summary, self._call("GET", f"/v1/sessions/{_quoted(session_id)}", None, timeout_s), "session")
+
+    def list_sessions(self, model: str, page_size: int, page_token: str, timeout_s: float) -> tuple[list[SessionSummary], str]:
+        query = urlencode(_without_none(model=model or None, page_size=page_size or None, page_token=page_token or None))
+        answer = self._call("GET", "/v1/sessions" + (f"?{query}" if query else ""), None, timeout_s)
+        return _read(lambda sessions: [_summary(session) for session in sessions], answer, "sessions"), _read(
+            str, answer, "next_page_token"
+        )
+
+    def close_session(self, session_id: str, timeout_s: float) -> None:
+        self._call("DELETE", f"/v1/sessions/{_quoted(session_id)}", None, timeout_s)
+
+    def models(self, timeout_s: float) -> list[Model]:
+        answer = self._call("GET", "/v1/models", None, timeout_s)
+        return _read(lambda models: [_model(model) for model in models], answer, "models")
+
+    def model(self, name: str, timeout_s: float) -> Model:
+        if not name:  # an empty name has no path of its own: the default model is marked in the list
+            models = [model for model in self.models(timeout_s) if model.is_default]
+            if not models:
+                raise from_detail(Detail("the server has no default model", "MODEL_NOT_FOUND"))
+            return models[0]
+        return _read(_model, self._call("GET", f"/v1/models/{_quoted(name)}", None, timeout_s), "model")
+
+    def close(self) -> None:
+        with self._lock:
+            idle, self._idle = self._idle, []
+        for connection in idle:
+            connection.close()
+
+    def _call(self, method: str, path: str, body: Mapping[str, Any] | None, timeout_s: float) -> Any:
+        status, headers, text = self._exchange(method, path, body, timeout_s)
+        if status == 204:
+            return None
+        try:
+            answer = json.loads(text)
+        except ValueError:
+            answer = None
+        if 200 <= status < 300 and isinstance(answer, dict):
+            return answer
+        if isinstance(answer, dict):
+            raise _error_of_problem(answer, status)
+        after_s = headers.get("Retry-After", "")
+        detail = Detail(
+            f"status {status} from {self._host}:{self._port}, and no JSON object",
+            retry_after_ms=int(after_s) * 1000 if after_s.isdigit() else None,
+        )
+        raise UnexpectedAnswer(detail) if status < 300 else from_detail(detail, http_status=status)
+
+    def _exchange(
+        self, method: str, path: str, body: Mapping[str, Any] | None, timeout_s: float
+    ) -> tuple[int, http.client.HTTPMessage, bytes]:
+        """One request and its whole answer. A connection that failed is not used again."""
+        connection = self._take()
+        connection.timeout = timeout_s
+        if connection.sock is not None:
+            connection.sock.settimeout(timeout_s)
+        payload = None if body is None else json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
+        headers = {"Accept": "application/json"}
+        if payload is not None:
+            headers["Content-Type"] = "application/json"
+        try:
+            connection.request(method, path, payload, headers)
+            response = connection.getresponse()
+            text = response.read()
+        except TimeoutError:
+            connection.close()
+            raise DeadlineExceeded(f"no answer from {self._host}:{self._port} within {timeout_s:g} s") from None
+        except (OSError, http.client.HTTPException) as error:
+            connection.close()
+            raise Unavailable(f"{self._host}:{self._port}: {error or type(error).__name__}") from None
+        if response.will_close:
+            connection.close()
+        else:
+            with self._lock:
+                self._idle.append(connection)
+        return response.status, response.headers, text
+
+    def _take(self) -> http.client.HTTPConnection:
+        """An idle connection that the server has not closed meanwhile, or a new one."""
+        while True:
+            with self._lock:
+                if not self._idle:
+                    return http.client.HTTPConnection(self._host, self._port)
+                connection = self._idle.pop()
+            if connection.sock is not None and _is_alive(connection.sock):
+                return connection
+            connection.close()
+
+
+def _is_alive(idle: socket.socket) -> bool:
+    """Nothing is due on an idle connection: if there is something to read, it is the end."""
+    idle.setblocking(False)
+    try:
+        idle.recv(1, socket.MSG_PEEK)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _quoted(word: str) -> str:
+    return quote(word, safe="@")
+
+
+def _without_none(**pairs: Any) -> dict[str, Any]:
+    return {name: value for name, value in pairs.items() if value is not None}
+
+
+def _act_body(call: ActCall) -> dict[str, Any]:
+    executed = [
+        _without_none(
+            state=None if step.state is None else step.state.tolist(),
+            action=None if step.action is None else step.action.tolist(),
+            reward=step.reward,
+        )
+        for step in call.executed
+    ]
+    return _without_none(
+        step=call.step,
+        observation={"state": call.state.tolist(), "executed": executed},
+        deadline_ms=call.deadline_ms,
+        want_planned_states=call.want_planned_states or None,
+    )
+
+
+def _options_out(options: SamplerOptions) -> dict[str, Any]:
+    given = options.given()
+    if given.get("kappa") == math.inf:
+        given["kappa"] = "infinity"
+    return given
+
+
+def _options_in(options: Mapping[str, Any]) -> SamplerOptions:
+    given = {name: options[name] for name in SamplerOptions.__dataclass_fields__ if options.get(name) is not None}
+    if given.get("kappa") == "infinity":
+        given["kappa"] = math.inf
+    for name in {"eta", "temperature", "kappa"} & set(given):
+        given[name] = float(np.float32(given[name]))
+    return SamplerOptions(**given)
+
+
+def _read(convert: Callable[[Any], T], answer: Any, *path: str) -> T:
+    """`convert(answer[path])`; an answer of another shape is an error, not a KeyError in the caller's program."""
+    try:
+        for name in path:
+            answer = answer[name]
+        return convert(answer)
+    except (KeyError, TypeError, ValueError) as error:
+        raise UnexpectedAnswer(f"the answer is not of the expected shape ({type(error).__name__}: {error})") from None
+
+
+def _error_of_problem(problem: Mapping[str, Any], status: int) -> AdaError:
+    detail = Detail(
+        message=str(problem.get("detail") or problem.get("title") or f"status {status}"),
+        reason=str(problem.get("reason") or ""),
+        field=str(problem.get("field") or ""),
+        committed_step=problem.get("committed_step"),
+        retry_after_ms=problem.get("retry_after_ms"),
+        error_id=str(problem.get("error_id") or ""),
+    )
+    return from_detail(detail, http_status=status)
+
+
+def _floats(values: Any) -> Floats:
+    return np.array(values, dtype=np.float32)
+
+
+def _results(results: Sequence[Mapping[str, Any]]) -> list[Chunk | AdaError]:
+    return [
+        _chunk(result["response"])
+        if result.get("response") is not None
+        else _error_of_problem(result["error"], int(result["error"].get("status", 500)))
+        for result in results
+    ]
+
+
+def _chunk(answer: Mapping[str, Any]) -> Chunk:
+    timings = answer["timings"]
+    planned = answer.get("planned_states")
+    return Chunk(
+        session_id=answer["session_id"],
+        step=answer["step"],
+        replayed=answer["replayed"],
+        actions=_floats(answer["actions"]),
+        planned_states=None if planned is None else _floats(planned),
+        latent_mean=_floats(answer["latent_mean"]),
+        latent_log_var=_floats(answer["latent_log_var"]),
+        predicted_state=_floats(answer["predicted_state"]),
+        evaluations=answer["evaluations"],
+        start=answer["start"],
+        renoised_rungs=answer.get("renoised_rungs", 0),
+        timings=Timings(timings["queue_us"], timings["compute_us"], timings["commit_us"], timings["total_us"]),
+        model=answer["model"],
+        model_digest=answer["model_digest"],
+        degraded=answer.get("degraded", False),
+    )
+
+
+def _model(model: Mapping[str, Any]) -> Model:
+    plain = {name: model[name] for name in Model.__dataclass_fields__ if name not in ("action_low", "action_high", "sampler")}
+    return Model(
+        **plain,
+        action_low=_floats(model["action_low"]),
+        action_high=_floats(model["action_high"]),
+        sampler=_options_in(model["sampler"]),
+    )
+
+
+def _summary(session: Mapping[str, Any]) -> SessionSummary:
+    special = ("options", "latent_mean", "latent_log_var")
+    plain = {name: session[name] for name in SessionSummary.__dataclass_fields__ if name not in special}
+    return SessionSummary(
+        **plain,
+        options=_options_in(session["options"]),
+        latent_mean=_floats(session["latent_mean"]),
+        latent_log_var=_floats(session["latent_log_var"]),
+    )

@@ -1,0 +1,125 @@
+"""The loop: environments in lockstep, one act or one batch of acts wherever a chunk is used up."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from ada_diffuser import environments
+from ada_diffuser.broker import ChunkBroker
+from ada_diffuser.client import Client
+from ada_diffuser.errors import AdaError
+from ada_diffuser.messages import Chunk
+from ada_diffuser.rollout.result import ActLog, Episode, Evaluation, Trial
+
+#: Called with the number of environment steps just made.
+Progress = Callable[[int], object]
+
+
+def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: None) -> Evaluation:
+    """Runs the trial's episodes, in groups of `trial.vector`, in as many sessions.
+
+    Rewards are reported with the actions, since a latent may live off them. Raises the `AdaError` of the first act that
+    cannot be had, and ValueError where environment and model do not fit.
+    """
+    started = time.monotonic()
+    acts, episodes = ActLog(), []
+    with ExitStack() as stack:
+        lanes = _open_lanes(client, trial, stack)
+        session = lanes[0].broker.session
+        for first in range(trial.seed, trial.seed + trial.episodes, len(lanes)):
+            seeds = range(first, min(first + len(lanes), trial.seed + trial.episodes))
+            group = lanes[: len(seeds)]
+            for lane, seed in zip(group, seeds, strict=True):
+                lane.start(seed)
+            _run(client, trial, group, acts, progress)
+            episodes += [lane.episode for lane in group]
+    return Evaluation(trial, session.model, session.options, episodes, acts, time.monotonic() - started)
+
+
+class _Lane:
+    """One environment and its session."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], broker: ChunkBroker) -> None:
+        self.env, self.broker = env, broker
+        self.done = True
+        self.episode = Episode(seed=0)
+        self.state = np.zeros(0, np.float32)
+
+    def start(self, seed: int) -> None:
+        """A new episode, of the environment and of the session."""
+        observation, _ = self.env.reset(seed=seed)
+        self.broker.reset(seed)
+        self.state = np.asarray(observation, np.float32)
+        self.episode, self.done = Episode(seed), False
+
+    def accept(self, chunk: Chunk) -> None:
+        """The answer of the act that was due."""
+        self.broker.accept(chunk)
+        self.episode.act_steps.append(len(self.episode.rewards))
+        self.episode.latents.append(chunk.latent_mean)
+
+    def step(self) -> None:
+        """Executes the next action of the chunk and reports its reward."""
+        action = self.broker.take(self.state)
+        observation, reward, terminated, truncated, facts = self.env.step(action)
+        self.broker.record(reward=float(reward))
+        self.episode.states.append(self.state)
+        self.episode.actions.append(action)
+        self.episode.rewards.append(float(reward))
+        if "context" in facts:
+            self.episode.contexts.append(np.atleast_1d(np.asarray(facts["context"], np.float32)).copy())
+        self.state = np.asarray(observation, np.float32)
+        self.done = bool(terminated or truncated)
+        if self.done:
+            failed = getattr(self.env.unwrapped, "failed", None)
+            self.episode.failed = bool(failed and failed(self.episode.total))
+
+
+def _open_lanes(client: Client, trial: Trial, stack: ExitStack) -> list[_Lane]:
+    lanes = []
+    for slot in range(min(trial.vector, trial.episodes)):
+        env = environments.make(trial.env)
+        stack.callback(env.close)
+        session = stack.enter_context(client.open_session(trial.model, seed=trial.seed + slot, options=trial.options))
+        wanted = (session.model.state_dim, session.model.action_dim)
+        offered = tuple(int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space))
+        if wanted != offered:
+            raise ValueError(
+                f"{trial.env} has {offered[0]} state and {offered[1]} action values, "
+                f"but model {session.model.name} has {wanted[0]} and {wanted[1]}"
+            )
+        lanes.append(_Lane(env, ChunkBroker(session)))
+    return lanes
+
+
+def _run(client: Client, trial: Trial, lanes: list[_Lane], acts: ActLog, progress: Progress) -> None:
+    while running := [lane for lane in lanes if not lane.done]:
+        due = [lane for lane in running if lane.broker.due]
+        if due:
+            _act(client, due, acts, batched=trial.vector > 1)
+        for lane in running:
+            lane.step()
+        progress(len(running))
+
+
+def _act(client: Client, due: list[_Lane], acts: ActLog, *, batched: bool) -> None:
+    asked = [(lane.broker.session, lane.broker.observation(lane.state)) for lane in due]
+    started = time.perf_counter()
+    if batched:
+        answers = client.act_batch(asked)
+    else:
+        answers = [session.act(observation.state, observation.executed) for session, observation in asked]
+    elapsed_s = time.perf_counter() - started
+    chunks = []
+    for lane, answer in zip(due, answers, strict=True):
+        if isinstance(answer, AdaError):
+            raise answer
+        lane.accept(answer)
+        chunks.append(answer)
+    acts.add(elapsed_s, chunks)

@@ -1,0 +1,146 @@
+"""A short film of one episode, as a GIF: the recorded actions played again in an environment that can render.
+
+Rendering runs in a process of its own, because MuJoCo reads `MUJOCO_GL` when it is imported and a machine without a screen
+may have EGL, OSMesa or neither: `python -m ada_diffuser.rollout.film EPISODE.npz FILM.gif`.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from ada_diffuser import environments
+from ada_diffuser.rollout.readout import Readout
+from ada_diffuser.rollout.result import Episode
+
+#: A film larger than this is thinned out and shrunk until it fits.
+BYTES_MAX = 6_000_000
+WIDTH = 360
+FRAME_MS = 50
+#: Half the side of the square that a point mass is drawn in.
+POINT_WORLD = 1.5
+
+
+def save_film(env: str, episode: Episode, readout: Readout | str, path: Path) -> str | None:
+    """Writes the film; None, or why there is none."""
+    with tempfile.TemporaryDirectory() as folder:
+        recorded = Path(folder) / "episode.npz"
+        seen = readout.of(episode) if isinstance(readout, Readout) else np.zeros((0, 0))
+        np.savez(
+            recorded,
+            env=env,
+            seed=episode.seed,
+            actions=np.array(episode.actions),
+            states=np.array(episode.states),
+            rewards=np.array(episode.rewards),
+            contexts=np.array(episode.contexts),
+            act_steps=np.array(episode.act_steps),
+            seen=seen,
+        )
+        reasons = []
+        for backend in _backends():
+            reason = _render_apart(recorded, path, backend)
+            if reason is None:
+                return None
+            reasons.append(f"{backend}: {reason}")
+        return "; ".join(reasons)
+
+
+def _backends() -> list[str]:
+    chosen = os.environ.get("MUJOCO_GL")
+    return [chosen] if chosen else ["egl", "osmesa"]
+
+
+def _render_apart(recorded: Path, path: Path, backend: str) -> str | None:
+    command = [sys.executable, "-m", __name__, str(recorded), str(path)]
+    environment = {**os.environ, "MUJOCO_GL": backend}
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    except subprocess.TimeoutExpired:
+        return "no film after 300 s"
+    if done.returncode == 0:
+        return None
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    return lines[-1].strip() if lines else f"ended with status {done.returncode}"
+
+
+def _frames(record: dict[str, NDArray[np.float32]]) -> Iterator[Image.Image]:
+    if str(record["env"]) in ("point-wind-s", environments.NAMES["point-wind-s"]):
+        yield from _point_frames(record)
+        return
+    env = environments.make(str(record["env"]), render_mode="rgb_array")
+    env.reset(seed=int(record["seed"]))
+    for step, action in enumerate(record["actions"]):
+        frame = Image.fromarray(np.asarray(env.render(), np.uint8))
+        frame = frame.resize((WIDTH, frame.height * WIDTH // frame.width))
+        yield _captioned(frame, record, step)
+        env.step(action)
+    env.close()
+
+
+def _point_frames(record: dict[str, NDArray[np.float32]]) -> Iterator[Image.Image]:
+    """The mass as a dot with its trail, the goal as a cross, the wind as an arrow."""
+
+    def pixel(at: NDArray[np.float32]) -> tuple[float, float]:
+        x, y = np.clip(at[:2], -POINT_WORLD, POINT_WORLD) / POINT_WORLD
+        return (1 + float(x)) * WIDTH / 2, (1 - float(y)) * WIDTH / 2
+
+    centre = WIDTH / 2
+    for step in range(len(record["states"])):
+        frame = Image.new("RGB", (WIDTH, WIDTH), "white")
+        draw = ImageDraw.Draw(frame)
+        draw.line((centre - 6, centre, centre + 6, centre), fill="gray")
+        draw.line((centre, centre - 6, centre, centre + 6), fill="gray")
+        trail = [pixel(past) for past in record["states"][max(0, step - 25) : step + 1]]
+        if len(trail) > 1:
+            draw.line(trail, fill=(160, 190, 230), width=2)
+        x, y = trail[-1]
+        wind_x, wind_y = record["contexts"][step] * 12
+        draw.line((x, y, x + wind_x, y - wind_y), fill=(200, 60, 40), width=2)
+        draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=(30, 90, 180))
+        yield _captioned(frame, record, step)
+
+
+def _captioned(frame: Image.Image, record: dict[str, NDArray[np.float32]], step: int) -> Image.Image:
+    """The frame with a line of numbers under it."""
+    words = [f"step {step}", f"return {record['rewards'][: step + 1].sum():.1f}"]
+    if record["contexts"].size:
+        words.append("context " + " ".join(f"{value:.1f}" for value in record["contexts"][step]))
+    if record["seen"].size:
+        act = int(np.searchsorted(record["act_steps"], step, side="right")) - 1
+        words.append("read out " + " ".join(f"{value:.1f}" for value in record["seen"][act]))
+    taller = Image.new("RGB", (frame.width, frame.height + 18), "black")
+    taller.paste(frame)
+    ImageDraw.Draw(taller).text((6, frame.height + 3), "    ".join(words), fill="white")
+    return taller
+
+
+def _write(frames: list[Image.Image], path: Path) -> None:
+    """As a GIF within `BYTES_MAX`: every second frame first, then smaller, until it fits."""
+    for stride, scale in ((1, 1.0), (2, 1.0), (2, 0.75), (3, 0.6), (4, 0.5), (8, 0.4)):
+        size = (int(frames[0].width * scale), int(frames[0].height * scale))
+        kept = [frame.resize(size).quantize(64, dither=Image.Dither.NONE) for frame in frames[::stride]]
+        kept[0].save(path, format="GIF", save_all=True, append_images=kept[1:], duration=FRAME_MS * stride, loop=0)
+        if path.stat().st_size <= BYTES_MAX:
+            return
+
+
+def main() -> int:
+    """Renders one recorded episode; the last line on stderr says what is wrong."""
+    recorded, path = Path(sys.argv[1]), Path(sys.argv[2])
+    with np.load(recorded) as stored:
+        record = {name: stored[name] for name in stored.files}
+    _write(list(_frames(record)), path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

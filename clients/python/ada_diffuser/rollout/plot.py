@@ -1,0 +1,89 @@
+"""The picture of a rollout: rewards and returns, and the true context beside the one read out of the latent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ada_diffuser.rollout.readout import Readout
+from ada_diffuser.rollout.result import Episode, Evaluation
+
+#: Shown episodes stand side by side, at most so many.
+EPISODES_SHOWN = 3
+
+
+def save_plot(result: Evaluation, readout: Readout | str, path: Path) -> None:
+    """Writes the picture in the format that the suffix names (png, pdf, svg)."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (rewards, returns, context) = pyplot.subplots(3, 1, figsize=(9, 9), height_ratios=(2, 2, 3), layout="constrained")
+    figure.suptitle(
+        f"{result.model.name} on {result.trial.env}: "
+        f"return {result.mean_return:.1f} ± {result.standard_error:.1f} over {len(result.episodes)} episodes"
+    )
+    _draw_rewards(rewards, result)
+    _draw_returns(returns, result)
+    _draw_context(context, result, readout)
+    figure.savefig(path, dpi=120, metadata={"Software": None} if path.suffix == ".png" else None)
+    pyplot.close(figure)
+
+
+def _draw_rewards(axes: Any, result: Evaluation) -> None:
+    rewards = _padded([episode.rewards for episode in result.episodes])
+    steps = np.arange(rewards.shape[1])
+    axes.plot(steps, np.nanmean(rewards, axis=0), color="C0", label="mean")
+    axes.fill_between(steps, *np.nanpercentile(rewards, (10, 90), axis=0), color="C0", alpha=0.2, label="10 to 90 %")
+    axes.set(xlabel="step", ylabel="reward")
+    axes.legend(loc="lower right")
+
+
+def _draw_returns(axes: Any, result: Evaluation) -> None:
+    for episode in result.episodes:
+        axes.plot(np.cumsum(episode.rewards), color="C3" if episode.failed else "C0", alpha=0.4, linewidth=0.8)
+    mean = np.nanmean(_padded([np.cumsum(episode.rewards).tolist() for episode in result.episodes]), axis=0)
+    axes.plot(mean, color="black", label="mean")
+    axes.set(xlabel="step", ylabel="return so far")
+    axes.legend(loc="lower left")
+
+
+def _draw_context(axes: Any, result: Evaluation, readout: Readout | str) -> None:
+    read = readout if isinstance(readout, Readout) else None
+    first = read.first_shown if read else 0
+    offset = 0
+    for n, episode in enumerate(result.episodes[first : first + EPISODES_SHOWN]):
+        _draw_one_context(axes, episode, read, offset, labelled=n == 0)
+        offset += len(episode.rewards)
+        axes.axvline(offset, color="0.8", linewidth=0.8)
+    axes.set(xlabel="step, episode after episode", ylabel="hidden context")
+    title = f"true context, and read out of the latent (R² = {read.r2:.3f} on episodes not fitted)" if read else readout
+    axes.set_title(title, fontsize=10)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc="upper right")
+
+
+def _draw_one_context(axes: Any, episode: Episode, read: Readout | None, offset: int, *, labelled: bool) -> None:
+    if not episode.contexts:
+        return
+    true = np.array(episode.contexts)
+    steps = offset + np.arange(len(true))
+    seen = read.of(episode) if read else None
+    for i in range(true.shape[1]):
+        name = f" {i}" if true.shape[1] > 1 else ""
+        axes.plot(steps, true[:, i], color=f"C{2 * i}", label=f"true{name}" if labelled else None)
+        if seen is not None:
+            at = offset + np.array(episode.act_steps)
+            label = f"read out{name}" if labelled else None
+            axes.plot(at, seen[:, i], ".-", color=f"C{2 * i + 1}", markersize=3, linewidth=0.8, label=label)
+
+
+def _padded(rows: list[list[float]]) -> np.ndarray[Any, Any]:
+    """Rows of different lengths as one array, NaN where a row has ended."""
+    table = np.full((len(rows), max(map(len, rows))), np.nan)
+    for i, row in enumerate(rows):
+        table[i, : len(row)] = row
+    return table

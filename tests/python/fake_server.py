@@ -1,0 +1,249 @@
+"""A double of the server for faults that a real one shows only by chance: the step protocol (R1, R2) and both faces, small.
+
+An act's actions are `step + executed rewards`, so a test sees what arrived. Faults are scripted: each act takes the next one.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from concurrent import futures
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import grpc
+
+from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
+
+CODES = {
+    "QUEUE_FULL": (grpc.StatusCode.RESOURCE_EXHAUSTED, 429),
+    "DRAINING": (grpc.StatusCode.UNAVAILABLE, 503),
+    "DEADLINE_COMPUTE": (grpc.StatusCode.DEADLINE_EXCEEDED, 504),
+    "STEP_OUT_OF_ORDER": (grpc.StatusCode.ABORTED, 409),
+    "STEP_PAYLOAD_MISMATCH": (grpc.StatusCode.FAILED_PRECONDITION, 422),
+    "ENGINE_PANIC": (grpc.StatusCode.INTERNAL, 500),
+    "SESSION_NOT_FOUND": (grpc.StatusCode.NOT_FOUND, 404),
+    "TOO_LARGE": (grpc.StatusCode.RESOURCE_EXHAUSTED, 413),
+}
+
+
+@dataclass
+class Refusal(Exception):
+    reason: str
+    committed_step: int | None = None
+    retry_after_ms: int | None = None
+    error_id: str = ""
+
+
+@dataclass
+class Session:
+    committed: int = 0
+    last: tuple[object, list[float]] | None = None
+
+
+@dataclass
+class Core:
+    """Sessions and scripted faults. `before` faults refuse, the fault "lost" commits and then answers UNAVAILABLE."""
+
+    faults: list[Refusal | str] = field(default_factory=list)
+    sessions: dict[str, Session] = field(default_factory=dict)
+    #: Every act that arrived: (session, step, observation).
+    seen: list[tuple[str, int, object]] = field(default_factory=list)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def open(self) -> str:
+        with self.lock:
+            name = f"s{len(self.sessions)}"
+            self.sessions[name] = Session()
+            return name
+
+    def act(self, name: str, step: int, observation: dict) -> tuple[list[float], bool]:
+        """The action, and whether it is a replay."""
+        with self.lock:
+            self.seen.append((name, step, observation))
+            fault = self.faults.pop(0) if self.faults else None
+            if isinstance(fault, Refusal):
+                raise fault
+            if name not in self.sessions:
+                raise Refusal("SESSION_NOT_FOUND")
+            session = self.sessions[name]
+            if step == session.committed and session.last:
+                if session.last[0] != observation:
+                    raise Refusal("STEP_PAYLOAD_MISMATCH", session.committed)
+                return session.last[1], True
+            if step != session.committed + 1:
+                raise Refusal("STEP_OUT_OF_ORDER", session.committed)
+            rewards = sum(done.get("reward", 0.0) for done in observation.get("executed", []))
+            session.committed, session.last = step, (observation, [step + rewards, observation["state"][0]])
+            if fault == "lost":
+                raise Refusal("DRAINING")
+            return session.last[1], False
+
+
+MODEL = {
+    **{"name": "fake", "digest": "0" * 64, "is_default": True, "state_dim": 2, "action_dim": 2, "plan_horizon": 4},
+    **{"block_len": 2, "obs_horizon": 1, "latent_dim": 1, "level_max": 5, "refined": True},
+    **{"action_low": [-1.0, -1.0], "action_high": [1.0, 1.0], "sampler": {"kappa": 1.0, "latent": "mean"}},
+}
+
+
+def _chunk(name: str, step: int, action: list[float], replayed: bool) -> dict:
+    timings = {"queue_us": 1, "compute_us": 2, "commit_us": 3, "total_us": 6}
+    return {
+        **{"session_id": name, "step": step, "replayed": replayed, "actions": [action, action, action]},
+        **{"latent_mean": [0.5], "latent_log_var": [-1.0], "predicted_state": [0.0, 0.0], "evaluations": 3},
+        **{"start": "warm", "renoised_rungs": 0, "timings": timings, "model": "fake", "model_digest": "0" * 64, "degraded": False},
+    }
+
+
+def _session(name: str, committed: int) -> dict:
+    numbers = {"seed": 1, "episode": 0, "age_ms": 0, "idle_ms": 0, "ttl_ms": 1, "state_bytes": 0}
+    words = {"session_id": name, "model": "fake", "model_digest": "0" * 64, "options": {"kappa": "infinity"}}
+    return {**numbers, **words, "committed_step": committed, "latent_mean": [], "latent_log_var": [], "busy": False}
+
+
+class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
+    """The gRPC face of the double."""
+
+    def __init__(self, core: Core) -> None:
+        self.core = core
+
+    def List(self, request, context):  # noqa: N802
+        return models_pb2.ListModelsResponse(models=[_model()])
+
+    def OpenSession(self, request, context):  # noqa: N802
+        session = agent_pb2.Session(session_id=self.core.open(), seed=request.seed)
+        return agent_pb2.OpenSessionResponse(session=session, model=_model())
+
+    def ResetSession(self, request, context):  # noqa: N802
+        self.core.sessions[request.session_id] = Session()
+        return agent_pb2.ResetSessionResponse(session=agent_pb2.Session(session_id=request.session_id, seed=request.seed))
+
+    def GetSession(self, request, context):  # noqa: N802
+        session = agent_pb2.Session(session_id=request.session_id, committed_step=self.core.sessions[request.session_id].committed)
+        return agent_pb2.GetSessionResponse(session=session)
+
+    def CloseSession(self, request, context):  # noqa: N802
+        self.core.sessions.pop(request.session_id, None)
+        return agent_pb2.CloseSessionResponse()
+
+    def Act(self, request, context):  # noqa: N802
+        try:
+            return self._act(request)
+        except Refusal as refusal:
+            trailers = [("ada-reason", refusal.reason)]
+            if refusal.committed_step is not None:
+                trailers.append(("ada-committed-step", str(refusal.committed_step)))
+            if refusal.retry_after_ms is not None:
+                trailers.append(("grpc-retry-pushback-ms", str(refusal.retry_after_ms)))
+            if refusal.error_id:
+                trailers.append(("ada-error-id", refusal.error_id))
+            context.set_trailing_metadata(trailers)
+            context.abort(CODES[refusal.reason][0], "refused")
+
+    def ActBatch(self, request, context):  # noqa: N802
+        results = []
+        for act in request.acts:
+            result = agent_pb2.ActResult(session_id=act.session_id, step=act.step)
+            try:
+                result.response.CopyFrom(self._act(act))
+            except Refusal as refusal:
+                code = CODES[refusal.reason][0].value[0]
+                result.error.CopyFrom(agent_pb2.Error(code=code, reason=refusal.reason, message="refused"))
+                if refusal.retry_after_ms is not None:
+                    result.error.retry_after_ms = refusal.retry_after_ms
+            results.append(result)
+        return agent_pb2.ActBatchResponse(results=results)
+
+    def _act(self, request):
+        executed = [{"reward": done.reward} if done.HasField("reward") else {} for done in request.observation.executed]
+        observation = {"state": list(request.observation.state), "executed": executed}
+        action, replayed = self.core.act(request.session_id, request.step, observation)
+        chunk = _chunk(request.session_id, request.step, action, replayed)
+        actions = agent_pb2.Matrix(values=action * 3, rows=3, columns=2)
+        return agent_pb2.ActResponse(**{**chunk, "actions": actions, "start": "START_WARM"})
+
+
+def _model() -> models_pb2.Model:
+    return models_pb2.Model(**{**MODEL, "sampler": models_pb2.SamplerOptions(kappa=1.0, latent="LATENT_MODE_MEAN")})
+
+
+class HttpFake(BaseHTTPRequestHandler):
+    """The REST face of the double; `core` is set on a subclass."""
+
+    protocol_version = "HTTP/1.1"
+    core: Core
+
+    def do_GET(self) -> None:
+        if self.path == "/v1/models":
+            return self._answer(200, {"models": [MODEL]})
+        name = self.path.split("/")[3]
+        return self._answer(200, {"session": _session(name, self.core.sessions[name].committed)})
+
+    def do_DELETE(self) -> None:
+        self.core.sessions.pop(self.path.split("/")[3], None)
+        self._answer(204, None)
+
+    def do_POST(self) -> None:
+        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        if self.path == "/v1/sessions":
+            return self._answer(201, {"session": _session(self.core.open(), 0), "model": MODEL})
+        if self.path == "/v1/act:batch":
+            return self._answer(200, {"results": [self._result(act) for act in body["acts"]]})
+        name, verb = self.path.split("/")[3:5]
+        if verb == "reset":
+            self.core.sessions[name] = Session()
+            return self._answer(200, {"session": _session(name, 0)})
+        result = self._result({"session_id": name, **body})
+        if "error" in result:
+            return self._answer(result["error"]["status"], result["error"])
+        return self._answer(200, result["response"])
+
+    def _result(self, act: dict) -> dict:
+        known = {"session_id": act["session_id"], "step": act["step"]}
+        try:
+            action, replayed = self.core.act(act["session_id"], act["step"], act["observation"])
+        except Refusal as refusal:
+            facts = {name: value for name, value in vars(refusal).items() if value not in (None, "")}
+            return {**known, "error": {"status": CODES[refusal.reason][1], "detail": "refused", **facts}}
+        return {**known, "response": _chunk(act["session_id"], act["step"], action, replayed)}
+
+    def _answer(self, status: int, body: dict | None) -> None:
+        text = b"" if body is None else json.dumps(body).encode()
+        self.send_response(status)
+        if body is not None:
+            self.send_header("Content-Length", str(len(text)))
+        self.end_headers()
+        self.wfile.write(text)
+
+    def log_message(self, *_: object) -> None:
+        """Says nothing."""
+
+
+@contextmanager
+def serving(core: Core, face: str) -> Iterator[str]:
+    """The double on a free port; its url."""
+    if face == "grpc":
+        server = grpc.server(futures.ThreadPoolExecutor(4))
+        fake = GrpcFake(core)
+        agent_pb2_grpc.add_AgentServicer_to_server(fake, server)
+        models_pb2_grpc.add_ModelsServicer_to_server(fake, server)
+        port = server.add_insecure_port("127.0.0.1:0")
+        server.start()
+        try:
+            yield f"grpc://127.0.0.1:{port}"
+        finally:
+            server.stop(None).wait()
+        return
+    handler = type("Handler", (HttpFake,), {"core": core})
+    web = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    web.daemon_threads = True
+    thread = threading.Thread(target=web.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{web.server_address[1]}"
+    finally:
+        web.shutdown()
+        web.server_close()

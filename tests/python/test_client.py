@@ -1,0 +1,277 @@
+"""The client against a double with scripted faults: retries keep the step, errors have their types, batches settle one by one."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from fake_server import Core, Refusal, serving
+
+from ada_diffuser import (
+    AdaError,
+    ChunkBroker,
+    Client,
+    DeadlineExceeded,
+    Executed,
+    InvalidInput,
+    NotFound,
+    Observation,
+    Overloaded,
+    PayloadMismatch,
+    RetryPolicy,
+    SamplerOptions,
+    ServerFault,
+    StepConflict,
+    TooLarge,
+    Unavailable,
+)
+from ada_diffuser.errors import Detail, SessionGone, UnexpectedAnswer, from_detail
+from ada_diffuser.faces import connect
+
+FAST = RetryPolicy(attempts=4, base_s=0.01, cap_s=0.02, budget_s=5.0)
+STATE = [0.25, -1.5]
+
+
+@pytest.fixture
+def core() -> Core:
+    return Core()
+
+
+@pytest.fixture(params=["grpc", "http"])
+def client(core: Core, request: pytest.FixtureRequest) -> Iterator[Client]:
+    with serving(core, request.param) as url, Client(url, retry=FAST) as client:
+        yield client
+
+
+def test_acts_count_up_and_carry_what_was_said(client: Client, core: Core) -> None:
+    with client.open_session(seed=1) as session:
+        first = session.act(STATE)
+        second = session.act(STATE, reward=[0.5, 2.0])
+        third = session.act(STATE, [Executed(reward=4.0)])
+    assert [first.step, second.step, third.step] == [1, 2, 3]
+    assert [chunk.actions[0, 0] for chunk in (first, second, third)] == [1.0, 4.5, 7.0]
+    assert first.actions.shape == (3, 2) and first.actions.dtype == np.float32
+    assert first.planned_states is None and first.start == "warm" and first.timings.total_us == 6
+    assert not core.sessions, "the context manager closes the session"
+
+
+@pytest.mark.parametrize("fault", ["lost", Refusal("DRAINING", retry_after_ms=5), Refusal("QUEUE_FULL"), Refusal("DEADLINE_COMPUTE")])
+def test_a_failed_act_is_sent_again_with_the_same_step_and_observation(client: Client, core: Core, fault: Refusal | str) -> None:
+    with client.open_session() as session:
+        session.act(STATE)
+        core.faults = [fault]
+        chunk = session.act([3.0, 4.0], reward=1.0)
+    assert chunk.step == session.committed_step == 2
+    assert chunk.replayed == (fault == "lost"), "a lost answer is answered again, not computed again"
+    first, again = core.seen[-2:]
+    assert first == again
+
+
+def test_retries_are_bounded_and_leave_the_session_where_it_was(client: Client, core: Core) -> None:
+    with client.open_session() as session:
+        core.faults = [Refusal("QUEUE_FULL")] * FAST.attempts
+        with pytest.raises(Overloaded):
+            session.act(STATE)
+        assert session.committed_step == 0 and len(core.seen) == FAST.attempts
+        assert session.act(STATE).step == 1
+
+
+def test_the_servers_wish_is_waited_for(client: Client, core: Core) -> None:
+    with client.open_session() as session:
+        core.faults = [Refusal("QUEUE_FULL", retry_after_ms=300)]
+        started = time.monotonic()
+        session.act(STATE)
+    assert time.monotonic() - started >= 0.3
+
+
+def test_a_wait_beyond_the_budget_is_not_begun(client: Client, core: Core) -> None:
+    with client.open_session() as session:
+        core.faults = [Refusal("DRAINING", retry_after_ms=60_000)]
+        started = time.monotonic()
+        with pytest.raises(Unavailable) as caught:
+            session.act(STATE)
+    assert caught.value.retry_after_ms == 60_000
+    assert time.monotonic() - started < 5
+
+
+@pytest.mark.parametrize(
+    ("refusal", "kind"),
+    [
+        (Refusal("STEP_OUT_OF_ORDER", committed_step=7), StepConflict),
+        (Refusal("STEP_PAYLOAD_MISMATCH", committed_step=7), PayloadMismatch),
+        (Refusal("SESSION_NOT_FOUND"), NotFound),
+        (Refusal("ENGINE_PANIC", error_id="e-1"), ServerFault),
+        (Refusal("TOO_LARGE"), TooLarge),
+    ],
+)
+def test_an_error_has_its_type_and_fields_and_is_not_retried(client: Client, core: Core, refusal: Refusal, kind: type[AdaError]) -> None:
+    with client.open_session() as session:
+        core.faults = [refusal]
+        with pytest.raises(kind) as caught:
+            session.act(STATE)
+    assert type(caught.value) is kind
+    assert caught.value.reason == refusal.reason
+    assert (caught.value.committed_step, caught.value.error_id) == (refusal.committed_step, refusal.error_id)
+    assert len(core.seen) == 1
+
+
+def test_after_a_conflict_the_session_catches_up(client: Client, core: Core) -> None:
+    with client.open_session() as session:
+        core.sessions[session.session_id].committed = 5
+        with pytest.raises(StepConflict) as caught:
+            session.act(STATE)
+        assert caught.value.committed_step == 5 == session.catch_up()
+        assert session.act(STATE).step == 6
+
+
+def test_a_batch_sends_again_only_what_failed(client: Client, core: Core) -> None:
+    sessions = [client.open_session() for _ in range(3)]
+    core.faults = ["lost", Refusal("ENGINE_PANIC"), Refusal("QUEUE_FULL")]
+    first, second, third = client.act_batch([(session, Observation(STATE)) for session in sessions])
+    assert not isinstance(first, AdaError) and first.replayed
+    assert isinstance(second, ServerFault)
+    assert not isinstance(third, AdaError) and not third.replayed
+    assert [name for name, _, _ in core.seen] == ["s0", "s1", "s2", "s0", "s2"]
+    assert [session.committed_step for session in sessions] == [1, 0, 1]
+
+
+def test_a_session_cannot_stand_twice_in_a_batch(client: Client) -> None:
+    session = client.open_session()
+    with pytest.raises(ValueError, match="twice"):
+        client.act_batch([(session, Observation(STATE))] * 2)
+
+
+@pytest.mark.parametrize(
+    ("state", "executed", "field"),
+    [
+        ([0.0, math.nan], (), "observation.state[1]"),
+        ([0.0, 1e39], (), "observation.state[1]"),
+        ([[0.0]], (), "observation.state"),
+        (["x"], (), "observation.state"),
+        ([0.0], [Executed(), Executed(action=[math.inf])], "observation.executed[1].action[0]"),
+        ([0.0], [Executed(reward=math.inf)], "observation.executed[0].reward"),
+    ],
+)
+def test_what_json_could_not_spell_is_refused_before_it_is_sent(
+    client: Client, core: Core, state: list[float], executed: list[Executed], field: str
+) -> None:
+    with client.open_session() as session, pytest.raises(InvalidInput) as caught:
+        session.act(state, executed)
+    assert (caught.value.field, caught.value.reason) == (field, "OBSERVATION_INVALID")
+    assert not core.seen
+
+
+def test_nobody_there_is_unavailable() -> None:
+    for face in ("grpc", "http"):
+        with Client(f"{face}://127.0.0.1:1", retry=RetryPolicy(attempts=2, base_s=0.01)) as client, pytest.raises(Unavailable):
+            client.models()
+
+
+def test_no_answer_in_time_is_a_deadline() -> None:
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        for face in ("grpc", "http"):
+            with Client(f"{face}://127.0.0.1:{port}", timeout_s=0.2, retry=RetryPolicy(attempts=1)) as client:
+                with pytest.raises((DeadlineExceeded, Unavailable)) as caught:
+                    client.models()
+                assert face == "grpc" or type(caught.value) is DeadlineExceeded
+
+
+def test_a_connection_that_the_server_closed_while_idle_is_not_used(core: Core) -> None:
+    """An idle kept-alive connection ends on the server's side at any time; opening a session must not fail over it."""
+    with serving(core, "http") as url, Client(url, retry=RetryPolicy(attempts=1)) as client:
+        client.open_session()
+        (idle,) = client._face._idle  # type: ignore[attr-defined]
+        import socket
+
+        idle.sock.shutdown(socket.SHUT_RD)
+        client.open_session()
+    assert len(core.sessions) == 2
+
+
+def test_the_broker_hands_out_and_reports(client: Client, core: Core) -> None:
+    with client.open_session() as session:
+        broker = ChunkBroker(session)
+        for step in range(4):
+            action = broker.action([float(step), 0.0])
+            assert action.shape == (2,)
+            broker.record(reward=step + 1.0)
+        assert session.committed_step == 2 and not broker.due
+        broker.replan()
+        broker.action([9.0, 0.0])
+    told = [observation["executed"] for _, _, observation in core.seen]  # type: ignore[index]
+    rewards = [[done["reward"] for done in executed] for executed in told]
+    assert rewards == [[], [1.0, 2.0, 3.0], [4.0]]
+
+
+def test_the_broker_tells_states_and_other_actions(core: Core) -> None:
+    with serving(core, "http") as url, Client(url) as client, client.open_session() as session:
+        broker = ChunkBroker(session)
+        for step in range(3):
+            broker.action([float(step), 0.5])
+        broker.record(action=[0.125, 0.25])
+        broker.action([3.0, 0.5])
+    first, second, third = core.seen[1][2]["executed"]  # type: ignore[index]
+    assert "state" not in first, "it is the state of the observation before"
+    assert (second["state"], third["state"]) == ([1.0, 0.5], [2.0, 0.5])
+    assert third["action"] == [0.125, 0.25] and first["action"] == [1.0, 0.0]
+
+
+def test_a_reset_starts_over(client: Client) -> None:
+    with client.open_session() as session:
+        broker = ChunkBroker(session)
+        broker.action(STATE)
+        broker.reset(seed=5)
+        assert session.committed_step == 0 and broker.due
+        assert broker.action(STATE)[0] == 1.0
+
+
+def test_options_from_words() -> None:
+    words = {"streaming": "False", "kappa": "inf", "latent": "sample", "sub_steps": "2"}
+    assert SamplerOptions.parse(words) == SamplerOptions(streaming=False, kappa=math.inf, latent="sample", sub_steps=2)
+    for wrong in ({"kapa": "1"}, {"streaming": "1"}, {"sub_steps": "x"}, {"latent": "median"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            SamplerOptions.parse(wrong)
+
+
+def test_urls() -> None:
+    for url in ("ftp://a:1", "grpc://a", "127.0.0.1:7777", "http://a:1/x"):
+        with pytest.raises(ValueError, match="host"):
+            connect(url)
+
+
+def test_errors_without_a_reason_go_by_code_or_status() -> None:
+    assert type(from_detail(Detail("no route"), grpc_code=14)) is Unavailable
+    assert type(from_detail(Detail("bad gateway"), http_status=502)) is Unavailable
+    assert type(from_detail(Detail("?"), http_status=418)) is UnexpectedAnswer
+    gone = from_detail(Detail("old", "SESSION_EXPIRED"), http_status=410)
+    assert type(gone) is SessionGone and isinstance(gone, NotFound)
+    assert pickle.loads(pickle.dumps(gone)).reason == "SESSION_EXPIRED"
+
+
+def test_an_answer_of_another_shape_is_named() -> None:
+    """A wrong port answers with something: the caller's program gets a typed error and no KeyError."""
+    from http.server import BaseHTTPRequestHandler, HTTPServer
+    from threading import Thread
+
+    class Other(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", "2")
+            self.end_headers()
+            self.wfile.write(b"{}")
+
+        def log_message(self, *_: object) -> None:
+            """Says nothing."""
+
+    with HTTPServer(("127.0.0.1", 0), Other) as web:
+        Thread(target=web.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+        with Client(f"http://127.0.0.1:{web.server_address[1]}") as client, pytest.raises(UnexpectedAnswer):
+            client.models()
+        web.shutdown()

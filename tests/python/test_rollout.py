@@ -1,0 +1,152 @@
+"""What a rollout makes of its episodes: statistics, the readout, the picture, the film, the command lines."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ada_diffuser import SamplerOptions, environments
+from ada_diffuser.commands import evaluate as evaluate_command
+from ada_diffuser.commands import parse_settings, server_url
+from ada_diffuser.commands import rollout as rollout_command
+from ada_diffuser.messages import Model, Timings
+from ada_diffuser.rollout import ActLog, Episode, Evaluation, Trial
+from ada_diffuser.rollout.film import save_film
+from ada_diffuser.rollout.plot import save_plot
+from ada_diffuser.rollout.readout import Readout, fit
+from ada_diffuser.rollout.report import markdown, table
+
+
+def played(env_name: str, seed: int, steps: int = 20) -> Episode:
+    """An episode of random actions, with latents that hold the context and something else."""
+    env = environments.make(env_name)
+    observation, _ = env.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    episode = Episode(seed)
+    for step in range(steps):
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        episode.states.append(np.asarray(observation, np.float32))
+        observation, reward, _, _, facts = env.step(action)
+        episode.actions.append(action)
+        episode.rewards.append(float(reward))
+        episode.contexts.append(facts["context"])
+        episode.act_steps.append(step)
+        mixed = [3 * facts["context"][0] - 1, rng.normal()]
+        episode.latents.append(np.array(mixed, np.float32))
+    env.close()
+    return episode
+
+
+def finished(env_name: str, episodes: list[Episode]) -> Evaluation:
+    acts = ActLog()
+    acts.call_ms, acts.acts, acts.evaluations, acts.timings = [1.0, 3.0], 2, 9, [Timings(1000, 2000, 3000, 6000)]
+    box = np.ones(1, np.float32)
+    options = SamplerOptions(streaming=True, kappa=float("inf"))
+    model = Model("fake", "ab" * 32, True, 1, 1, 8, 4, 1, 2, 10, -box, box, options, True)
+    return Evaluation(Trial(env_name, episodes=len(episodes)), model, options, episodes, acts, 1.0)
+
+
+def test_statistics() -> None:
+    episodes = [Episode(0, rewards=[-1.0, -2.0]), Episode(1, rewards=[-6.0]), Episode(2, rewards=[-12.0], failed=True)]
+    result = finished("point-wind-s", episodes)
+    assert result.mean_return == -7.0 and result.median_return == -6.0 and result.failures == 1
+    assert result.standard_error == pytest.approx(np.std([3, 6, 12], ddof=1) / np.sqrt(3))
+    assert result.latency_ms(50) == 2.0 and result.server_ms("commit", 50) == 3.0 and result.evaluations_per_act == 4.5
+    stored = json.loads(json.dumps(result.as_json(), allow_nan=False))
+    assert stored["returns"] == [-3.0, -6.0, -12.0] and stored["failed_seeds"] == [2]
+    assert stored["options"]["kappa"] == "infinity"
+
+
+def test_the_readout_finds_a_linear_context_and_nothing_in_noise() -> None:
+    episodes = [played("cheetah-wind-s", seed) for seed in range(4)]
+    read = fit(episodes)
+    assert isinstance(read, Readout) and read.r2 > 0.999 and read.first_shown == 2
+    assert np.allclose(read.of(episodes[3])[:, 0], [context[0] for context in episodes[3].contexts], atol=0.05)
+    for episode in episodes:
+        episode.latents = [latent[1:] for latent in episode.latents]
+    noise = fit(episodes)
+    assert isinstance(noise, Readout) and noise.r2 < 0.2
+
+
+def test_a_readout_that_cannot_be_says_why() -> None:
+    episodes = [played("cheetah-vel-e", seed, steps=3) for seed in (0, 1)]
+    assert "two episodes" in str(fit(episodes[:1]))
+    assert "nothing to tell apart" in str(fit([episodes[0], episodes[1]]))
+    without = [Episode(0, latents=[np.zeros(0, np.float32)]), Episode(1, latents=[np.zeros(0, np.float32)])]
+    assert "no latent" in str(fit(without))
+
+
+def test_the_table_and_the_markdown_hold_the_numbers() -> None:
+    result = finished("point-wind-s", [Episode(0, rewards=[-1.0]), Episode(1, rewards=[-3.0])])
+    text = table(result, "no readout, because")
+    for words in ("-2.00 ± 1.00", "0 of 2", "p50 2.00 ms, p99 2.98 ms", "4.50", "no readout, because", "kappa=inf"):
+        assert words in text
+    rows = markdown([result], ["kappa", "streaming"]).splitlines()
+    assert len(rows) == 3 and len({row.count("|") for row in rows}) == 1
+    assert rows[2].startswith("| point-wind-s | fake | inf | true | -2.00 ± 1.00 | -2.00 | 0/2 | 4.50 |")
+
+
+@pytest.mark.parametrize("env", ["cheetah-wind-s", "point-wind-s"])
+def test_the_picture_is_drawn_and_the_same_each_time(tmp_path: Path, env: str) -> None:
+    episodes = [played(env, seed) for seed in range(3)]
+    result, read = finished(env, episodes), fit(episodes)
+    for name in ("a.png", "b.png"):
+        save_plot(result, read, tmp_path / name)
+    with Image.open(tmp_path / "a.png") as picture:
+        assert min(picture.size) > 500 and len(set(picture.convert("L").tobytes())) > 10
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_the_point_film_has_a_frame_a_step(tmp_path: Path) -> None:
+    episodes = [played("point-wind-s", seed) for seed in range(2)]
+    assert save_film("point-wind-s", episodes[1], fit(episodes), tmp_path / "film.gif") is None
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames == 20 and film.info["loop"] == 0
+
+
+def test_the_cheetah_film_is_made_or_its_absence_explained(tmp_path: Path) -> None:
+    path = tmp_path / "film.gif"
+    reason = save_film("cheetah-wind-s", played("cheetah-wind-s", 3), "none", path)
+    if reason is None:
+        with Image.open(path) as film:
+            assert film.n_frames == 20
+    else:
+        assert "egl:" in reason and not path.exists()
+
+
+def test_a_renderer_that_does_not_exist_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(os.environ, "MUJOCO_GL", "crayons")
+    reason = save_film("cheetah-wind-s", played("cheetah-wind-s", 3, steps=2), "none", tmp_path / "film.gif")
+    assert reason is not None and "crayons" in reason
+
+
+def test_command_line_words() -> None:
+    assert server_url("127.0.0.1:1", None) == "grpc://127.0.0.1:1"
+    assert server_url("http://h:1", None) == "http://h:1"
+    assert server_url("http://h:1", "grpc") == "grpc://h:1"
+    for wrong in (["kappa"], ["kappa=1", "kappa=2"]):
+        with pytest.raises(ValueError, match="kappa"):
+            parse_settings(wrong)
+    grid = list(evaluate_command.combinations(["kappa=0,inf", "streaming=true,false"]))
+    assert len(set(grid)) == 4 and grid[0] == SamplerOptions(kappa=0.0, streaming=True)
+    assert list(evaluate_command.combinations([])) == [SamplerOptions()]
+
+
+def test_failures_end_with_status_1_and_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    nobody = ["--url", "127.0.0.1:1", "--wait", "0"]
+    cases = [
+        (rollout_command.main, ["--env", "cheetah-wind-s", *nobody]),
+        (rollout_command.main, ["--env", "cheetah-wind-s", "--option", "kapa=1"]),
+        (rollout_command.main, ["--env", "cheetah-wind-s", "--episodes", "0"]),
+        (evaluate_command.main, ["--env", "cheetah-wind-s", "--set", "kappa=x"]),
+        (evaluate_command.main, ["--env", "cheetah-wind-s", *nobody]),
+    ]
+    for main, words in cases:
+        assert main(words) == 1
+        error = capsys.readouterr().err
+        assert error.startswith("ada-") and error.count("\n") == 1, error
