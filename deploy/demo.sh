@@ -1,18 +1,20 @@
 #!/bin/sh
-# Starts the server on a free port, lets the default model drive HalfCheetah in a hidden wind, and leaves a table, a plot and a film in out/.
+# Starts the server on a free port, lets the default model drive HalfCheetah in a hidden wind, and leaves a plot and a film in out/.
 set -eu
 episodes=${DEMO_EPISODES:-8}
+python=.venv/bin/python
 mkdir -p out
-target/release/ada-server --listen 127.0.0.1:0 --port-file out/port >out/server.log 2>&1 &
+port=$($python -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
+target/release/ada-server --listen "127.0.0.1:$port" >out/server.log 2>&1 &
 server=$!
 trap 'kill $server 2>/dev/null; wait $server 2>/dev/null || true' EXIT
 tries=0
-until [ -s out/port ]; do
+until $python -c "import urllib.request; urllib.request.urlopen('http://127.0.0.1:$port/readyz')" 2>/dev/null; do
     kill -0 $server 2>/dev/null || { echo "the server ended; its log:" >&2; cat out/server.log >&2; exit 1; }
-    tries=$((tries + 1)); [ $tries -lt 300 ] || { echo "the server is not ready after 30 s; see out/server.log" >&2; exit 1; }
+    tries=$((tries + 1))
+    [ $tries -lt 100 ] || { echo "the server is not ready; see out/server.log" >&2; exit 1; }
     sleep 0.1
 done
-port=$(cat out/port)
 echo "server ready on 127.0.0.1:$port, log in out/server.log"
 .venv/bin/ada-rollout --env cheetah-wind-s --model cheetah-wind-s --url "grpc://127.0.0.1:$port" --episodes "$episodes" \
     --plot out/demo.png --film out/demo.gif

@@ -34,7 +34,9 @@ pub struct ServerConfig {
     pub io_threads: usize,
     /// Open connections; one more is answered 503 and closed.
     pub connections_max: usize,
-    /// Time between the signal to end and the hard end of what still runs.
+    /// From the signal to end until connections are asked to leave; new work is refused (DRAINING) and `/readyz` fails, so that everyone can learn of it.
+    pub drain_notice_ms: u64,
+    /// From then on to the hard end of what still runs.
     pub drain_timeout_ms: u64,
 }
 
@@ -150,7 +152,7 @@ pub enum LogFormat {
 
 impl Default for ServerConfig {
     fn default() -> Self {
-        Self { listen: SocketAddr::from(([127, 0, 0, 1], 7777)), io_threads: 0, connections_max: 4096, drain_timeout_ms: 10_000 }
+        Self { listen: SocketAddr::from(([127, 0, 0, 1], 7777)), io_threads: 0, connections_max: 4096, drain_notice_ms: 250, drain_timeout_ms: 10_000 }
     }
 }
 

@@ -239,3 +239,34 @@ impl ServiceError {
         }
     }
 }
+
+#[cfg(test)]
+impl ServiceError {
+    /// One of each kind with its codes in both tables and its word, as service.md lists them: (error, gRPC, HTTP, reason).
+    pub fn table() -> Vec<(Self, i32, u16, &'static str)> {
+        let (id, retry_after_ms, committed, step) = (Uuid::nil(), 1500, 3, 9);
+        vec![
+            (Self::invalid(Part::Observation, "observation.state", "short"), 3, 400, "OBSERVATION_INVALID"),
+            (Self::invalid(Part::Options, "options.eta", "2"), 3, 400, "OPTIONS_INVALID"),
+            (Self::invalid(Part::Request, "ttl_ms", "0"), 3, 400, "REQUEST_INVALID"),
+            (Self::StepOutOfOrder { step, committed }, 10, 409, "STEP_OUT_OF_ORDER"),
+            (Self::SessionBusy { committed }, 10, 409, "SESSION_BUSY"),
+            (Self::StepPayloadMismatch { step, committed }, 9, 422, "STEP_PAYLOAD_MISMATCH"),
+            (Self::SessionNotFound, 5, 404, "SESSION_NOT_FOUND"),
+            (Self::SessionExpired, 5, 410, "SESSION_EXPIRED"),
+            (Self::SessionEvicted, 5, 410, "SESSION_EVICTED"),
+            (Self::ModelNotFound { model: "x".into() }, 5, 404, "MODEL_NOT_FOUND"),
+            (Self::TooLarge { what: "bytes", limit: 1 }, 8, 413, "TOO_LARGE"),
+            (Self::QueueFull { retry_after_ms }, 8, 429, "QUEUE_FULL"),
+            (Self::Quota { retry_after_ms }, 8, 429, "QUOTA"),
+            (Self::Deadline { stage: Stage::Admission }, 4, 504, "DEADLINE_ADMISSION"),
+            (Self::Deadline { stage: Stage::Queue }, 4, 504, "DEADLINE_QUEUE"),
+            (Self::Deadline { stage: Stage::Compute }, 4, 504, "DEADLINE_COMPUTE"),
+            (Self::Draining { retry_after_ms }, 14, 503, "DRAINING"),
+            (Self::NotReady { retry_after_ms }, 14, 503, "NOT_READY"),
+            (Self::NonFiniteOutput { id }, 13, 500, "NONFINITE_OUTPUT"),
+            (Self::EnginePanic { id }, 13, 500, "ENGINE_PANIC"),
+            (Self::Internal { id }, 13, 500, "INTERNAL"),
+        ]
+    }
+}

@@ -64,20 +64,20 @@ impl Gate {
     }
 }
 
-/// Serves both faces until `draining` is cancelled, then lets every request in flight end, for `server.drain_timeout_ms` at most.
-pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, draining: CancellationToken) {
+/// Serves both faces until `leave` is cancelled, then lets every request in flight end, for `server.drain_timeout_ms` at most.
+pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
     let (tracker, hard_end) = (TaskTracker::new(), CancellationToken::new());
     let places = Arc::new(Semaphore::new(config.server.connections_max));
     loop {
         let accepted = tokio::select! {
-            () = draining.cancelled() => break,
+            () = leave.cancelled() => break,
             accepted = listener.accept() => accepted,
         };
         match accepted {
             Ok((stream, _)) => match places.clone().try_acquire_owned() {
                 Ok(permit) => {
                     let gate = Gate { _place: Arc::new((permit, tracker.token())), hard_end: hard_end.clone() };
-                    tokio::spawn(connection(stream, faces.clone(), config.clone(), draining.clone(), gate));
+                    tokio::spawn(connection(stream, faces.clone(), config.clone(), leave.clone(), gate));
                 }
                 Err(_) => turn_away(stream),
             },
@@ -101,15 +101,15 @@ fn turn_away(mut stream: TcpStream) {
     tokio::spawn(async move { timeout(ACCEPT_PAUSE, stream.write_all(BUSY)).await });
 }
 
-async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, draining: CancellationToken, gate: Gate) {
+async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, leave: CancellationToken, gate: Gate) {
     metrics::gauge!("ada_connections").increment(1.0);
     let patience = Duration::from_millis(config.connection.preface_timeout_ms);
     let greeted = tokio::select! {
         greeted = timeout(patience, has_spoken(&stream)) => greeted,
-        () = draining.cancelled() => Ok(false),
+        () = leave.cancelled() => Ok(false),
     };
     match greeted {
-        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &draining, &gate)).await,
+        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &leave, &gate)).await,
         Ok(false) => {}
         Err(_) => metrics::counter!("ada_connections_timed_out_total").increment(1),
     }
@@ -128,7 +128,7 @@ async fn has_spoken(stream: &TcpStream) -> bool {
     }
 }
 
-async fn talk(stream: TcpStream, faces: Faces, config: &Config, draining: &CancellationToken, gate: &Gate) {
+async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &CancellationToken, gate: &Gate) {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "no TCP_NODELAY");
     }
@@ -137,7 +137,7 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, draining: &Cance
     let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(stream), answer));
     let ended = tokio::select! {
         ended = connection.as_mut() => ended,
-        () = draining.cancelled() => {
+        () = leave.cancelled() => {
             connection.as_mut().graceful_shutdown();
             connection.await
         }

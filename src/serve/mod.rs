@@ -21,7 +21,11 @@ use listener::Faces;
 use registry::{Registry, RegistryError};
 use service::Service;
 use std::{future::Future, io, net::SocketAddr, sync::Arc, time::Duration};
-use tokio::{net::TcpListener, time::interval};
+use tokio::{
+    net::TcpListener,
+    time::{interval, sleep},
+};
+use tokio_util::sync::CancellationToken;
 
 /// What the engine's threads get to end after the last connection is gone.
 const ENGINE_PATIENCE: Duration = Duration::from_secs(2);
@@ -84,7 +88,8 @@ impl Server {
         let (grpc, health) = grpc::router(service.clone())?;
         grpc::report(&health, false).await;
         let faces = Faces { grpc, http: http::router(http::State { service: service.clone(), metrics: metrics.clone() }) };
-        let listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), service.draining().clone()));
+        let leave = CancellationToken::new();
+        let listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), leave.clone()));
         let loaded = load(&service, config.clone()).await;
         if loaded.is_ok() {
             grpc::report(&health, true).await;
@@ -97,6 +102,8 @@ impl Server {
         }
         grpc::report(&health, false).await;
         service.drain();
+        sleep(Duration::from_millis(config.server.drain_notice_ms)).await;
+        leave.cancel();
         if listening.await.is_err() {
             tracing::error!("the accept loop ended by panic");
         }

@@ -3,7 +3,11 @@
 use super::{
     conv1d::{ConvOp, Grads3},
     host::{grad_like, output, slice, values},
-    kernels::{convolution::ConvShape, gru::Gru as Kernel, product::Packed},
+    kernels::{
+        convolution::ConvShape,
+        gru::{Gru as Kernel, GruRun},
+        product::Packed,
+    },
     params::{Init, Params},
 };
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
@@ -106,7 +110,9 @@ impl CustomOp3 for GruOp {
         let grad = grad.contiguous()?;
         let held = values(recurrent)?;
         let weights = held.split_at(3 * self.hidden * self.hidden);
-        let mut grads = self.plan(x.shape())?.backward(&values(x)?, &values(h0)?, weights, &values(states)?, &values(&grad)?);
+        let (inputs, initial, states) = (values(x)?, values(h0)?, values(states)?);
+        let run = GruRun { inputs: &inputs, initial: &initial, states: &states };
+        let mut grads = self.plan(x.shape())?.backward(run, weights, &values(&grad)?);
         grads.weight.extend_from_slice(&grads.bias);
         let initial = if h0.track_op() { grad_like(grads.initial, h0)? } else { None };
         let weight = if recurrent.track_op() { grad_like(grads.weight, recurrent)? } else { None };

@@ -6,6 +6,8 @@
 
 pub mod activation;
 pub mod attention;
+#[cfg(test)]
+mod candle_faults;
 pub mod conv1d;
 pub mod gru;
 mod host;
@@ -14,6 +16,10 @@ pub mod kernels;
 pub mod linear;
 pub mod norm;
 pub mod params;
+#[cfg(test)]
+mod testing;
+#[cfg(test)]
+mod tests;
 pub mod time_embedding;
 
 pub use activation::{gelu_tanh, mish, relu, silu};

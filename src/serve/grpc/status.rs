@@ -39,3 +39,21 @@ pub fn status(error: &ServiceError) -> Status {
     put("ada-error-id", error.error_id().map(|id| id.to_string()));
     Status::with_metadata(code(error), error.to_string(), trailers)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_row_of_the_table() {
+        for (error, grpc, _, reason) in ServiceError::table() {
+            let status = status(&error);
+            let trailer = |name: &str| status.metadata().get(name).map(|value| value.to_str().unwrap().to_owned());
+            assert_eq!((i32::from(status.code()), trailer("ada-reason").as_deref()), (grpc, Some(reason)), "{error:?}");
+            assert_eq!(trailer("ada-field").as_deref(), error.field(), "{error:?}");
+            assert_eq!(trailer("ada-committed-step"), error.committed_step().map(|_| "3".to_owned()), "{error:?}");
+            assert_eq!(trailer("grpc-retry-pushback-ms"), error.retry_after_ms().map(|_| "1500".to_owned()), "{error:?}");
+            assert_eq!(trailer("ada-error-id").is_some(), grpc == 13, "{error:?}");
+        }
+    }
+}

@@ -101,3 +101,24 @@ impl IntoResponse for Problem {
         response
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_row_of_the_table() {
+        for (error, _, http, reason) in ServiceError::table() {
+            let problem = serde_json::to_value(Problem::from(&error)).unwrap();
+            assert_eq!((problem["status"].as_u64(), problem["reason"].as_str()), (Some(http.into()), Some(reason)), "{error:?}");
+            assert_eq!(problem["field"].as_str(), error.field(), "{error:?}");
+            assert_eq!(problem["committed_step"].as_u64(), error.committed_step(), "{error:?}");
+            assert_eq!(problem.get("error_id").is_some(), http == 500, "{error:?}");
+            let response = Problem::from(&error).into_response();
+            assert_eq!(response.status().as_u16(), http);
+            assert_eq!(response.headers()["content-type"], "application/problem+json");
+            let retry = response.headers().get("retry-after").map(|value| value.to_str().unwrap().to_owned());
+            assert_eq!(retry, error.retry_after_ms().map(|_| "2".to_owned()), "seconds, rounded up: {error:?}");
+        }
+    }
+}

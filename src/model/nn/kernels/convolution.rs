@@ -3,7 +3,10 @@
 //! The transposed convolution is [`Convolution::spread`], the map from the gradient of the result to the gradient of the input;
 //! its own backward is then the other two maps. So three maps serve both layers in both directions.
 
-use super::product::{Packed, Rows, Start, product};
+use super::{
+    join,
+    product::{Packed, Rows, Start, product},
+};
 
 /// Channels, kernel, stride and padding (both ends, zeros) of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,14 +40,14 @@ pub struct Convolution {
 impl ConvShape {
     /// The weights for [`Convolution::gather`].
     pub fn pack_gather(&self, weight: &[f32]) -> Packed {
-        let k_offset: Vec<usize> = (0..self.kernel).flat_map(|tap| (0..self.c_in).map(move |c| c * self.kernel + tap)).collect();
-        Packed::new(weight, &k_offset, self.c_out, self.c_in * self.kernel)
+        let row = self.c_in * self.kernel;
+        Packed::new(weight, &every(1, row), self.c_out, row)
     }
 
     /// The weights for [`Convolution::spread`]: taps in reverse.
     pub fn pack_spread(&self, weight: &[f32]) -> Packed {
         let row = self.c_in * self.kernel;
-        let k_offset: Vec<usize> = (0..self.kernel).rev().flat_map(|tap| (0..self.c_out).map(move |o| o * row + tap)).collect();
+        let k_offset: Vec<usize> = (0..self.c_out).flat_map(|o| (0..self.kernel).rev().map(move |tap| o * row + tap)).collect();
         Packed::new(weight, &k_offset, self.c_in, self.kernel)
     }
 
@@ -58,6 +61,11 @@ fn start(bias: Option<&[f32]>) -> Start<'_> {
     bias.map_or(Start::Zero, Start::Bias)
 }
 
+/// Where a window of `kernel` steps of `channels` holds the terms of a chain: taps within channels, the order of the weights.
+fn window(kernel: usize, channels: usize) -> Vec<usize> {
+    (0..channels).flat_map(|c| (0..kernel).map(move |tap| tap * channels + c)).collect()
+}
+
 /// `0, stride, 2 stride, ...`
 pub fn every(stride: usize, count: usize) -> Vec<usize> {
     (0..count).map(|i| i * stride).collect()
@@ -68,7 +76,7 @@ impl Convolution {
     pub fn gather(&self, x: &[f32], weight: &Packed, bias: Option<&[f32]>) -> Vec<f32> {
         let mut out = vec![0.0; self.batch * self.narrow_steps * self.shape.c_out];
         let padded = self.padded(x);
-        let (row_offset, k_offset) = (self.window_starts(), every(1, self.shape.kernel * self.shape.c_in));
+        let (row_offset, k_offset) = (self.window_starts(), window(self.shape.kernel, self.shape.c_in));
         let rows = Rows { values: padded.as_deref().unwrap_or(x), row_offset: &row_offset, k_offset: &k_offset };
         product(rows, weight, start(bias), &mut out, self.shape.c_out);
         out
@@ -82,7 +90,7 @@ impl Convolution {
         let stuffed = self.stuffed(dy);
         let steps = self.wide_steps + kernel - 1;
         let row_offset: Vec<usize> = (0..self.batch).flat_map(|b| (0..self.wide_steps).map(move |s| (b * steps + s) * c_out)).collect();
-        let k_offset = every(1, kernel * c_out);
+        let k_offset = window(kernel, c_out);
         let rows = Rows { values: stuffed.as_deref().unwrap_or(dy), row_offset: &row_offset, k_offset: &k_offset };
         product(rows, weight, start(bias), &mut out, c_in);
         out
@@ -97,13 +105,7 @@ impl Convolution {
         let rows = Rows { values: padded.as_deref().unwrap_or(x), row_offset: &row_offset, k_offset: &k_offset };
         let mut transposed = vec![0.0; kernel * c_in * c_out];
         product(rows, &packed, Start::Zero, &mut transposed, c_out);
-        let mut grad = vec![0.0; transposed.len()];
-        for (o, grad) in grad.chunks_exact_mut(c_in * kernel).enumerate() {
-            for (c, grad) in grad.chunks_exact_mut(kernel).enumerate() {
-                grad.iter_mut().enumerate().for_each(|(tap, grad)| *grad = transposed[(tap * c_in + c) * c_out + o]);
-            }
-        }
-        grad
+        join::transpose(&transposed, c_out, &window(kernel, c_in))
     }
 
     /// Steps of a padded window.

@@ -19,6 +19,17 @@ pub struct Gru {
     pub hidden: usize,
 }
 
+/// A run that has been: what went in and what came out.
+#[derive(Clone, Copy, Debug)]
+pub struct GruRun<'a> {
+    /// Projected inputs, `(batch, steps, 3 hidden)`.
+    pub inputs: &'a [f32],
+    /// Initial states, `(batch, hidden)`.
+    pub initial: &'a [f32],
+    /// All states, `(batch, steps, hidden)`.
+    pub states: &'a [f32],
+}
+
 /// What backward gives.
 pub struct GruGrads {
     /// To the projected inputs, `(batch, steps, 3 hidden)`.
@@ -110,19 +121,19 @@ impl Gru {
     }
 
     /// The state before each step, `(batch, steps, hidden)`.
-    fn states_before(&self, initial: &[f32], states: &[f32]) -> Vec<f32> {
-        let mut before = Vec::with_capacity(states.len());
-        for (initial, states) in initial.chunks_exact(self.hidden).zip(states.chunks_exact(self.steps * self.hidden)) {
+    fn states_before(&self, run: GruRun) -> Vec<f32> {
+        let mut before = Vec::with_capacity(run.states.len());
+        for (initial, states) in run.initial.chunks_exact(self.hidden).zip(run.states.chunks_exact(self.steps * self.hidden)) {
             before.extend_from_slice(initial);
             before.extend_from_slice(&states[..states.len() - self.hidden]);
         }
         before
     }
 
-    /// Gradients from `grad`, the gradient to [`Self::forward`]'s result `states`; `recurrent` is (weight `(3 hidden, hidden)`, bias).
-    pub fn backward(&self, x: &[f32], initial: &[f32], recurrent: (&[f32], &[f32]), states: &[f32], grad: &[f32]) -> GruGrads {
+    /// Gradients from `grad`, the gradient to the states of `run`; `recurrent` is (weight `(3 hidden, hidden)`, bias).
+    pub fn backward(&self, run: GruRun, recurrent: (&[f32], &[f32]), grad: &[f32]) -> GruGrads {
         let (size, row, count) = (self.hidden, 3 * self.hidden, self.batch * self.steps);
-        let before = self.states_before(initial, states);
+        let before = self.states_before(run);
         let mut projected = vec![0.0; count * row];
         let forward = Packed::new(recurrent.0, &every(1, size), row, size);
         let (rows, k_offset) = (every(size, count), every(1, size));
@@ -135,7 +146,7 @@ impl Gru {
                 let dh = &mut dh[b * size..][..size];
                 dh.iter_mut().zip(&grad[at * size..][..size]).for_each(|(dh, grad)| *dh += grad);
                 let (p, dx) = (&mut projected[at * row..][..row], &mut inputs[at * row..][..row]);
-                step_back(StepBack { x: &x[at * row..][..row], p, h: &before[at * size..][..size], dx, dh });
+                step_back(StepBack { x: &run.inputs[at * row..][..row], p, h: &before[at * size..][..size], dx, dh });
             }
             let row_offset: Vec<usize> = (0..self.batch).map(|b| (b * self.steps + t) * row).collect();
             let rows = Rows { values: &projected, row_offset: &row_offset, k_offset: &every(1, row) };

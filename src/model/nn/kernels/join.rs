@@ -30,7 +30,7 @@ pub fn concat(a: &[f32], b: &[f32], widths: [usize; 2]) -> Vec<f32> {
     out
 }
 
-/// The reverse of [`concat`].
+/// The reverse of [`concat()`].
 pub fn split(joined: &[f32], widths: [usize; 2]) -> [Vec<f32>; 2] {
     let rows = joined.len() / (widths[0] + widths[1]);
     let (mut a, mut b) = (Vec::with_capacity(rows * widths[0]), Vec::with_capacity(rows * widths[1]));
@@ -39,4 +39,19 @@ pub fn split(joined: &[f32], widths: [usize; 2]) -> [Vec<f32>; 2] {
         b.extend_from_slice(&row[widths[0]..]);
     }
     [a, b]
+}
+
+/// The rows of a matrix of `columns` columns, in the given order, as columns; by strips of 16, so that what is read and written stays
+/// in the cache.
+pub fn transpose(matrix: &[f32], columns: usize, order: &[usize]) -> Vec<f32> {
+    const STRIP: usize = 16;
+    let rows = order.len();
+    let mut out = vec![0.0; matrix.len()];
+    for (strip, out) in out.chunks_mut(STRIP * rows).enumerate() {
+        for (i, row) in order.iter().enumerate() {
+            let row = &matrix[row * columns..][strip * STRIP..columns.min((strip + 1) * STRIP)];
+            out[i..].iter_mut().step_by(rows).zip(row).for_each(|(out, value)| *out = *value);
+        }
+    }
+    out
 }

@@ -54,7 +54,7 @@ pub fn sigmoid(x: f32) -> f32 {
 #[inline(always)]
 pub fn tanh(x: f32) -> f32 {
     let (size, square) = (x.abs(), x * x);
-    let series = polynomial(square, [-5.704_988_7e-3, 2.063_908_9e-2, -5.373_971_6e-2, 1.333_144_2e-1, -3.333_328_2e-1]);
+    let series = polynomial(square, [-5.704_988_7e-3, 2.063_909e-2, -5.373_971_6e-2, 1.333_144_2e-1, -3.333_328e-1]);
     let near = (square * x).mul_add(series, x);
     let far = (1.0 - 2.0 / (exp(2.0 * size) + 1.0)).copysign(x);
     if size < 0.625 { near } else { far }
@@ -100,7 +100,7 @@ pub fn silu_derivative(x: f32) -> f32 {
 /// Twice the argument of the hyperbolic tangent in GELU: `2 sqrt(2/pi) (x + 0.044715 x^3)`.
 #[inline(always)]
 fn gelu_argument(x: f32) -> f32 {
-    1.595_769_1 * (x * x * x).mul_add(0.044_715, x)
+    1.595_769 * (x * x * x).mul_add(0.044_715, x)
 }
 
 /// GELU by its hyperbolic tangent, `x/2 (1 + tanh u) = x sigmoid(2u)` (Hendrycks and Gimpel 2016; PyTorch `approximate="tanh"`).
@@ -113,7 +113,7 @@ pub fn gelu(x: f32) -> f32 {
 #[inline(always)]
 pub fn gelu_derivative(x: f32) -> f32 {
     let s = sigmoid(gelu_argument(x));
-    let slope = 1.595_769_1 * (x * x).mul_add(0.134_145, 1.0);
+    let slope = 1.595_769 * (x * x).mul_add(0.134_145, 1.0);
     (x * slope * (1.0 - s)).mul_add(s, s)
 }
 

@@ -30,28 +30,47 @@ pub struct NormGrads {
     pub bias: Vec<f32>,
 }
 
-/// Scratch by channel: the group's mean and inverse standard deviation spread over its channels, and two sums.
+/// Scratch by channel: the group's mean and inverse standard deviation spread over its channels, two sums, and their group means.
 struct Scratch {
     mean: Vec<f32>,
     rstd: Vec<f32>,
     first: Vec<f32>,
     second: Vec<f32>,
+    even: Vec<f32>,
+    odd: Vec<f32>,
 }
 
 impl Scratch {
     fn new(channels: usize) -> Self {
         let zeros = || vec![0.0; channels];
-        Self { mean: zeros(), rstd: zeros(), first: zeros(), second: zeros() }
+        Self { mean: zeros(), rstd: zeros(), first: zeros(), second: zeros(), even: zeros(), odd: zeros() }
     }
 }
 
-/// The mean over each group of per-channel sums, spread over the group's channels of `out` after `finish`.
+/// `finish` of the mean of each group over channels and time, from sums over time by channel, spread over the group's channels.
 #[inline(always)]
-fn fold_groups(norm: Norm, sums: &[f32], out: &mut [f32], finish: impl Fn(f32) -> f32) {
+fn fold_groups(norm: Norm, sums: impl Fn(usize) -> f32, out: &mut [f32], finish: impl Fn(f32) -> f32) {
     let width = norm.channels / norm.groups;
     let inverse = 1.0 / (norm.steps * width) as f32;
-    for (sums, out) in sums.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
-        let value = finish(math::sum(width, |i| sums[i]) * inverse);
+    if width >= math::LANES {
+        for (group, out) in out.chunks_exact_mut(width).enumerate() {
+            let value = finish(math::sum(width, |i| sums(group * width + i)) * inverse);
+            out.fill(value);
+        }
+        return;
+    }
+    // Narrow groups: all at once, each in ascending order, as one chain after the other would only wait. The total of a group
+    // builds up in its first channel.
+    for first in (0..norm.channels).step_by(width) {
+        out[first] = sums(first);
+    }
+    for i in 1..width {
+        for first in (0..norm.channels).step_by(width) {
+            out[first] += sums(first + i);
+        }
+    }
+    for out in out.chunks_exact_mut(width) {
+        let value = finish(out[0] * inverse);
         out.fill(value);
     }
 }
@@ -64,7 +83,7 @@ fn statistics(norm: Norm, x: &[f32], scratch: &mut Scratch) {
     for row in x.chunks_exact(norm.channels) {
         first.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
     }
-    fold_groups(norm, first, mean, |mean| mean);
+    fold_groups(norm, |c| first[c], mean, |mean| mean);
     first.fill(0.0);
     for row in x.chunks_exact(norm.channels) {
         for ((sum, x), mean) in first.iter_mut().zip(row).zip(&*mean) {
@@ -72,7 +91,7 @@ fn statistics(norm: Norm, x: &[f32], scratch: &mut Scratch) {
             *sum = deviation.mul_add(deviation, *sum);
         }
     }
-    fold_groups(norm, first, rstd, |variance| 1.0 / (variance + norm.eps).sqrt());
+    fold_groups(norm, |c| first[c], rstd, |variance| 1.0 / (variance + norm.eps).sqrt());
 }
 
 /// Applies `f(z)` to the normalised, scaled and shifted values of an item.
@@ -119,7 +138,7 @@ fn through_mish(x: &[f32], dz: &mut [f32], scratch: &Scratch, weight: &[f32], bi
 /// `dz * normalised` are left in `scratch.first` and `scratch.second`.
 #[inline(always)]
 fn through_statistics(norm: Norm, x: &[f32], dz: &mut [f32], weight: &[f32], scratch: &mut Scratch) {
-    let Scratch { mean, rstd, first, second } = scratch;
+    let Scratch { mean, rstd, first, second, even, odd } = scratch;
     let channels = norm.channels;
     first.fill(0.0);
     second.fill(0.0);
@@ -130,13 +149,10 @@ fn through_statistics(norm: Norm, x: &[f32], dz: &mut [f32], weight: &[f32], scr
             *second = dz.mul_add((x - mean) * rstd, *second);
         }
     }
-    let (mut even, mut odd) = (vec![0.0; channels], vec![0.0; channels]);
-    for (out, sums) in [(&mut even, &*first), (&mut odd, &*second)] {
-        let weighted: Vec<f32> = sums.iter().zip(weight).map(|(sum, weight)| sum * weight).collect();
-        fold_groups(norm, &weighted, out, |mean| mean);
-    }
+    fold_groups(norm, |c| first[c] * weight[c], even, |mean| mean);
+    fold_groups(norm, |c| second[c] * weight[c], odd, |mean| mean);
     for (x, dz) in x.chunks_exact(channels).zip(dz.chunks_exact_mut(channels)) {
-        let columns = mean.iter().zip(&*rstd).zip(weight.iter().zip(even.iter().zip(&odd)));
+        let columns = mean.iter().zip(&*rstd).zip(weight.iter().zip(even.iter().zip(&*odd)));
         for ((dz, x), ((mean, rstd), (weight, (even, odd)))) in dz.iter_mut().zip(x).zip(columns) {
             let normalised = (x - mean) * rstd;
             *dz = rstd * (-normalised).mul_add(*odd, dz.mul_add(*weight, -even));

@@ -35,17 +35,11 @@ impl Packed {
         for (panel, start) in (0..n).step_by(PANEL * LANE).enumerate() {
             let width = panel_width(n, panel);
             let panel = &mut lanes[panel * PANEL * k..][..width * k];
-            for (lane, first) in (start..n.min(start + width * LANE)).step_by(LANE).enumerate() {
-                let columns = LANE.min(n - first);
-                for (k, &offset) in k_offset.iter().enumerate() {
-                    let out = &mut panel[k * width + lane].0[..columns];
-                    let from = offset + first * column_stride;
-                    if column_stride == 1 {
-                        out.copy_from_slice(&values[from..from + columns]);
-                    } else {
-                        out.iter_mut().enumerate().for_each(|(j, out)| *out = values[from + j * column_stride]);
-                    }
-                }
+            let (end, values) = (n.min(start + PANEL * LANE), &values[start * column_stride..]);
+            if column_stride == 1 {
+                copy_rows(panel, values, k_offset, end - start);
+            } else {
+                copy_columns(panel, values, k_offset, (end - start, column_stride));
             }
         }
         Self { k, n, lanes }
@@ -54,6 +48,28 @@ impl Packed {
     /// Columns.
     pub fn columns(&self) -> usize {
         self.n
+    }
+}
+
+/// Fills a panel from rows that are contiguous.
+fn copy_rows(panel: &mut [Lane], values: &[f32], k_offset: &[usize], columns: usize) {
+    for (lanes, &offset) in panel.chunks_exact_mut(columns.div_ceil(LANE)).zip(k_offset) {
+        let row = values[offset..offset + columns].chunks(LANE);
+        lanes.iter_mut().zip(row).for_each(|(lane, row)| lane.0[..row.len()].copy_from_slice(row));
+    }
+}
+
+/// Fills a panel from columns `stride` apart, by blocks of `k` that stay in the first cache. Columns nearer to each other than that
+/// are interleaved, so a block of one stride reads in the order of memory.
+fn copy_columns(panel: &mut [Lane], values: &[f32], k_offset: &[usize], (columns, stride): (usize, usize)) {
+    let (width, block) = (columns.div_ceil(LANE), stride.clamp(1, 64));
+    for (panel, k_offset) in panel.chunks_mut(block * width).zip(k_offset.chunks(block)) {
+        for column in 0..columns {
+            let values = &values[column * stride..];
+            for (row, &offset) in k_offset.iter().enumerate() {
+                panel[row * width + column / LANE].0[column % LANE] = values[offset];
+            }
+        }
     }
 }
 
@@ -174,6 +190,7 @@ fn portable(tile: &Tile, out: &mut [f32]) {
 }
 
 #[cfg(target_arch = "x86_64")]
+#[allow(clippy::needless_range_loop, reason = "tiles are addressed by row and lane")]
 mod x86 {
     use super::{LANE, Tile};
     use std::arch::x86_64::*;

@@ -1,0 +1,224 @@
+//! Every layer against central differences, on odd shapes, on strided input, by row, and with every instruction set.
+
+use super::{testing::*, *};
+use candle_core::{Result, Tensor};
+use std::collections::BTreeMap;
+
+type Layer = Box<dyn Fn(&Tensor, &Params) -> Result<Tensor>>;
+
+/// A layer's result as a function of its input and its parameters: `inputs[0]` is `x`, the rest stand in the order of names.
+fn as_function(layer: Layer, names: Vec<String>) -> impl Fn(&[Tensor]) -> Result<Tensor> {
+    move |inputs| {
+        let named: BTreeMap<String, Tensor> = names.iter().cloned().zip(inputs[1..].iter().cloned()).collect();
+        layer(&inputs[0], &Params::loaded(named))
+    }
+}
+
+fn layers() -> Vec<(&'static str, Tensor, Layer)> {
+    let conv = |c_in, c_out, kernel, stride, padding| ConvShape { c_in, c_out, kernel, stride, padding };
+    let convolution = |shape| -> Layer { Box::new(move |x, p| Conv1d::new(shape, p)?.forward(x)) };
+    let transpose = |shape| -> Layer { Box::new(move |x, p| ConvTranspose1d::new(shape, p)?.forward(x)) };
+    let group_norm = |groups, channels| -> Layer { Box::new(move |x, p| GroupNormMish::new(groups, channels, p)?.forward(x)) };
+    let layer_norm = |affine| -> Layer { Box::new(move |x, p| LayerNorm::new(19, affine, 1e-6, p)?.forward(x)) };
+    vec![
+        ("linear", gaussian(1, (7, 5)), Box::new(|x, p| Linear::new(5, 67, p)?.forward(x))),
+        ("linear, three dimensions", gaussian(2, (3, 2, 18)), Box::new(|x, p| Linear::new(18, 3, p)?.forward(x))),
+        ("convolution", gaussian(3, (3, 7, 4)), convolution(conv(4, 18, 5, 1, 2))),
+        ("convolution without padding", gaussian(4, (2, 6, 3)), convolution(conv(3, 5, 3, 1, 0))),
+        ("convolution, more padding than taps", gaussian(14, (2, 4, 3)), convolution(conv(3, 2, 2, 1, 2))),
+        ("convolution of stride 2, even", gaussian(5, (2, 8, 3)), convolution(conv(3, 4, 3, 2, 1))),
+        ("convolution of stride 2, odd", gaussian(6, (2, 7, 3)), convolution(conv(3, 4, 4, 2, 1))),
+        ("pointwise convolution", gaussian(7, (2, 5, 3)), convolution(conv(3, 33, 1, 1, 0))),
+        ("transposed convolution", gaussian(8, (3, 4, 3)), transpose(conv(3, 5, 4, 2, 1))),
+        ("transposed convolution of stride 3", gaussian(9, (2, 3, 4)), transpose(conv(4, 2, 3, 3, 0))),
+        ("group norm and mish", gaussian(10, (3, 5, 12)), group_norm(4, 12)),
+        ("group norm and mish, wide groups", gaussian(11, (2, 3, 40)), group_norm(2, 40)),
+        ("layer norm", gaussian(12, (2, 4, 19)), layer_norm(true)),
+        ("layer norm, plain", gaussian(13, (2, 4, 19)), layer_norm(false)),
+    ]
+}
+
+/// Fresh parameters, jogged so that weights of 1 and biases of 0 hide nothing.
+fn parameters(x: &Tensor, layer: &Layer) -> (Vec<String>, Vec<Tensor>) {
+    let params = Params::fresh(5);
+    layer(x, &params).unwrap();
+    let jog = |(i, tensor): (usize, Tensor)| (&tensor + (gaussian(50 + i as u64, tensor.shape()) * 0.3).unwrap()).unwrap();
+    let vars = params.vars();
+    let values = vars.values().map(|var| var.as_tensor().copy().unwrap()).enumerate().map(jog);
+    (vars.keys().cloned().collect(), values.collect())
+}
+
+#[test]
+fn layers_against_central_differences() {
+    for (name, x, layer) in layers() {
+        println!("{name}");
+        let (names, values) = parameters(&x, &layer);
+        let inputs: Vec<Tensor> = std::iter::once(x).chain(values).collect();
+        check_gradients(&inputs, &as_function(layer, names));
+    }
+}
+
+#[test]
+fn strided_input_and_rows_alone() {
+    for (name, x, layer) in layers() {
+        println!("{name}");
+        let params = Params::fresh(5);
+        let y = layer(&x, &params).unwrap();
+        let strided = scrambled(&x, 0, x.rank() - 1);
+        assert_eq!(bits(&layer(&strided, &params).unwrap()), bits(&y));
+        let through = |inputs: &[Tensor]| layer(&inputs[0].transpose(0, inputs[0].rank() - 1)?, &params);
+        let straight = gradients(&[x.clone()], &|inputs| layer(&inputs[0], &params));
+        let back = gradients(&[x.transpose(0, x.rank() - 1).unwrap().contiguous().unwrap()], &through);
+        assert_eq!(bits(&back[0].transpose(0, x.rank() - 1).unwrap()), bits(&straight[0]));
+        check_rows(&[x], &|inputs| layer(&inputs[0], &params));
+    }
+}
+
+/// Packing once at construction and packing at each call are one and the same.
+#[test]
+fn frozen_weights_give_the_same_bits() {
+    for (name, x, layer) in layers() {
+        let fresh = Params::fresh(5);
+        let y = layer(&x, &fresh).unwrap();
+        let frozen = Params::loaded(fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().copy().unwrap())).collect());
+        assert_eq!(bits(&layer(&x, &frozen).unwrap()), bits(&y), "{name}");
+        assert!(frozen.unused().is_empty());
+    }
+}
+
+/// GRU inputs: x, h0, then parameters by name.
+fn gru(inputs: &[Tensor]) -> Result<Tensor> {
+    let names = ["bias_hh_l0", "bias_ih_l0", "weight_hh_l0", "weight_ih_l0"];
+    let named = names.iter().map(|name| (*name).to_owned()).zip(inputs[2..].iter().cloned()).collect();
+    Gru::new(3, 5, &Params::loaded(named))?.forward(&inputs[0], &inputs[1])
+}
+
+#[test]
+fn gru_against_central_differences() {
+    let inputs =
+        [gaussian(1, (3, 4, 3)), gaussian(2, (3, 5)), gaussian(3, 15), gaussian(4, 15), gaussian(5, (15, 5)), gaussian(6, (15, 3))];
+    check_gradients(&inputs, &gru);
+    check_rows(&inputs[..2], &|rows| gru(&[rows, &inputs[2..]].concat()));
+    let strided = [&[scrambled(&inputs[0], 0, 1), scrambled(&inputs[1], 0, 1)], &inputs[2..]].concat();
+    assert_eq!(bits(&gru(&strided).unwrap()), bits(&gru(&inputs).unwrap()));
+}
+
+#[test]
+fn gru_packed_once_gives_the_same_bits() {
+    let (x, h0, fresh) = (gaussian(1, (2, 3, 4)), gaussian(2, (2, 20)), Params::fresh(5));
+    let y = Gru::new(4, 20, &fresh).unwrap().forward(&x, &h0).unwrap();
+    let frozen = Params::loaded(fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().copy().unwrap())).collect());
+    assert_eq!(bits(&Gru::new(4, 20, &frozen).unwrap().forward(&x, &h0).unwrap()), bits(&y));
+}
+
+#[test]
+fn attention_against_central_differences() {
+    for (batch, steps, heads, head_dim) in [(2, 3, 2, 4), (2, 17, 1, 3), (1, 2, 3, 17)] {
+        let qkv = gaussian(1, (batch, steps, 3 * heads * head_dim));
+        check_gradients(&[qkv.clone()], &|inputs| attention(&inputs[0], heads));
+        check_rows(&[qkv.clone()], &|inputs| attention(&inputs[0], heads));
+        assert_eq!(bits(&attention(&scrambled(&qkv, 1, 2), heads).unwrap()), bits(&attention(&qkv, heads).unwrap()));
+    }
+}
+
+#[test]
+fn joins_against_central_differences() {
+    let (x, e, y) = (gaussian(1, (2, 3, 5)), gaussian(2, (2, 5)), gaussian(3, (2, 3, 4)));
+    check_gradients(&[x.clone(), e.clone()], &|inputs| add_channel_bias(&inputs[0], &inputs[1]));
+    check_gradients(&[x.clone(), y.clone()], &|inputs| concat_channels(&[&inputs[0], &inputs[1], &inputs[0]]));
+    let expected = Tensor::cat(&[&x, &y], 2).unwrap();
+    assert_eq!(bits(&concat_channels(&[&x, &y]).unwrap()), bits(&expected));
+    let expected = x.broadcast_add(&e.unsqueeze(1).unwrap()).unwrap();
+    assert_eq!(bits(&add_channel_bias(&scrambled(&x, 0, 2), &e).unwrap()), bits(&expected));
+}
+
+#[test]
+fn activations_against_central_differences() {
+    for activation in [mish, silu, gelu_tanh, relu] {
+        // No value within a step of relu's corner.
+        let x = gaussian(1, (3, 11)).affine(1.0, 0.0).unwrap();
+        let away = x.abs().unwrap().ge(0.02).unwrap().where_cond(&x, &x.ones_like().unwrap()).unwrap();
+        check_gradients(&[away.clone()], &|inputs| activation(&inputs[0]));
+        check_rows(&[away], &|inputs| activation(&inputs[0]));
+    }
+}
+
+/// candle's own Mish has a gradient of NaN from x = 89 on.
+#[test]
+fn gradients_far_out_are_finite() {
+    let x = Tensor::new(&[-1e4_f32, -89.0, -20.5, 20.5, 89.0, 1e4], &candle_core::Device::Cpu).unwrap();
+    for activation in [mish, silu, gelu_tanh, relu] {
+        let grad = gradients(&[x.clone()], &|inputs| activation(&inputs[0]));
+        assert!(flat(&grad[0]).iter().all(|grad| grad.is_finite()));
+    }
+}
+
+#[test]
+fn wrong_shapes_are_errors() {
+    let p = Params::fresh(1);
+    let shape = ConvShape { c_in: 3, c_out: 2, kernel: 5, stride: 1, padding: 0 };
+    assert!(Linear::new(3, 2, &p).unwrap().forward(&gaussian(1, (2, 4))).is_err());
+    assert!(Conv1d::new(shape, &p.scope("conv")).unwrap().forward(&gaussian(1, (2, 4, 3))).is_err());
+    assert!(Conv1d::new(shape, &p.scope("conv")).unwrap().forward(&gaussian(1, (8, 3))).is_err());
+    assert!(GroupNormMish::new(3, 8, &p).is_err());
+    assert!(LayerNorm::new(8, true, 1e-5, &p.scope("norm")).unwrap().forward(&gaussian(1, (2, 4))).is_err());
+    assert!(attention(&gaussian(1, (2, 4, 8)), 2).is_err());
+    assert!(concat_channels(&[&gaussian(1, (2, 4, 8)), &gaussian(1, (2, 3, 8))]).is_err());
+    assert!(add_channel_bias(&gaussian(1, (2, 4, 8)), &gaussian(1, (2, 7))).is_err());
+}
+
+/// `tests/golden/make_nn.py` tells how PyTorch made these numbers, in float64.
+#[test]
+fn layers_against_pytorch() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/nn.safetensors");
+    let golden = candle_core::safetensors::load(path, &candle_core::Device::Cpu).unwrap();
+    let conv = |c_out, kernel, stride, padding| ConvShape { c_in: 6, c_out, kernel, stride, padding };
+    let single = |layer: fn(&Tensor) -> Result<Tensor>| -> Layer { Box::new(move |x, _| layer(x)) };
+    let cases: Vec<(&str, Layer)> = vec![
+        ("linear", Box::new(|x, p| Linear::new(7, 35, p)?.forward(x))),
+        ("conv", Box::new(move |x, p| Conv1d::new(conv(20, 5, 1, 2), p)?.forward(x))),
+        ("conv_stride", Box::new(move |x, p| Conv1d::new(conv(10, 3, 2, 1), p)?.forward(x))),
+        ("conv_transpose", Box::new(move |x, p| ConvTranspose1d::new(conv(10, 4, 2, 1), p)?.forward(x))),
+        ("group_norm_mish", Box::new(|x, p| GroupNormMish::new(4, 20, p)?.forward(x))),
+        ("layer_norm", Box::new(|x, p| LayerNorm::new(21, true, 1e-5, p)?.forward(x))),
+        ("layer_norm_plain", Box::new(|x, p| LayerNorm::new(21, false, 1e-6, p)?.forward(x))),
+        ("attention", single(|x| attention(x, 2))),
+        ("mish", single(mish)),
+        ("silu", single(silu)),
+        ("gelu_tanh", single(gelu_tanh)),
+        ("relu", single(relu)),
+    ];
+    for (name, layer) in cases {
+        compare(&golden, name, &["x"], &|inputs, p| layer(&inputs[0], p));
+    }
+    compare(&golden, "gru", &["x", "h0"], &|inputs, p| Gru::new(6, 9, p)?.forward(&inputs[0], &inputs[1]));
+    let sinusoid = time_embedding::sinusoid(&golden["sinusoid.x"], 32).unwrap();
+    assert!(distance(&flat(&sinusoid), &flat(&golden["sinusoid.y"])) < 1e-6);
+}
+
+/// Result and every gradient of one golden case, within a few roundings.
+fn compare(
+    golden: &std::collections::HashMap<String, Tensor>,
+    name: &str,
+    inputs: &[&str],
+    layer: &dyn Fn(&[Tensor], &Params) -> Result<Tensor>,
+) {
+    let prefix = format!("{name}.p.");
+    let parameters: BTreeMap<String, Tensor> =
+        golden.iter().filter_map(|(key, value)| Some((key.strip_prefix(&prefix)?.to_owned(), value.clone()))).collect();
+    let vars = |named: Vec<(String, Tensor)>| -> Vec<(String, candle_core::Var)> {
+        named.into_iter().map(|(key, value)| (key, candle_core::Var::from_tensor(&value).unwrap())).collect()
+    };
+    let inputs = vars(inputs.iter().map(|key| ((*key).to_owned(), golden[&format!("{name}.{key}")].clone())).collect());
+    let parameters = vars(parameters.into_iter().collect());
+    let store = parameters.iter().map(|(key, var)| (key.clone(), var.as_tensor().clone())).collect();
+    let tensors: Vec<Tensor> = inputs.iter().map(|(_, var)| var.as_tensor().clone()).collect();
+    let y = layer(&tensors, &Params::loaded(store)).unwrap();
+    assert!(distance(&flat(&y), &flat(&golden[&format!("{name}.y")])) < 2e-6, "{name}: result");
+    let grads = (&y * &golden[&format!("{name}.r")]).unwrap().sum_all().unwrap().backward().unwrap();
+    let named = inputs.iter().map(|(key, var)| (format!("{name}.d{key}"), var));
+    for (key, var) in named.chain(parameters.iter().map(|(key, var)| (format!("{name}.dp.{key}"), var))) {
+        let error = distance(&flat(grads.get(var).expect("a gradient")), &flat(&golden[&key]));
+        assert!(error < 4e-6, "{key}: {error}");
+    }
+}

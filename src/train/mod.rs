@@ -1,0 +1,252 @@
+//! How checkpoints are made: recipe -> data set -> stage 1 -> stage 2 -> checkpoint. Losses live beside the networks they train
+//! (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here the crank is turned.
+pub mod ceiling;
+pub mod dataset;
+pub mod learner;
+pub mod log;
+pub mod optimizer;
+pub mod probe;
+pub mod recipe;
+pub mod report;
+pub mod resume;
+pub mod ridge;
+mod ship;
+pub mod stage1;
+pub mod stage2;
+pub mod tensorboard;
+
+use crate::model::config::ModelConfig;
+use crate::model::diffusion::refine::LatentRouting;
+use anyhow::{Result, bail, ensure};
+use dataset::{Split, hdf5};
+use learner::{Learner, Scalars};
+use log::{Clock, Log};
+use recipe::{Gate, Recipe};
+use resume::{Identity, Stage, Store};
+use stage1::ElboTask;
+use stage2::RefineTask;
+use std::{
+    path::{Path, PathBuf},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
+
+/// Where a run keeps its state and its logs, inside the output directory; the checkpoint itself lies beside it.
+const TRAINING_DIR: &str = "training";
+
+/// What a run needs beside its recipe.
+pub struct Options {
+    /// Output directory.
+    pub out: PathBuf,
+    /// Stop after this many steps of this process, as if interrupted.
+    pub stop_after_steps: Option<usize>,
+    /// Set by the binary when the user interrupts: the run saves its state and ends after the step in progress.
+    pub stop: Arc<AtomicBool>,
+    /// The wall clock, for the logs.
+    pub clock: Box<Clock>,
+}
+
+/// How a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// The checkpoint is complete.
+    Finished,
+    /// The state is saved; the same command goes on.
+    Stopped,
+}
+
+/// The fixed half of a run: recipe, data, architecture.
+pub struct Task {
+    /// The recipe.
+    pub recipe: Recipe,
+    /// The data, normalized.
+    pub split: Split,
+    /// SHA-256 of the data set.
+    pub dataset_digest: String,
+    /// The architecture, without the latent spread, which only training tells.
+    pub config: ModelConfig,
+}
+
+impl Task {
+    /// Reads and checks the data set of a recipe.
+    ///
+    /// # Errors
+    /// If the data set cannot be read or does not fit the recipe.
+    pub fn new(recipe: Recipe) -> Result<Self> {
+        let dataset = hdf5::read(&recipe.data)?;
+        let (len, why) = recipe.episode_len_min();
+        dataset.require_len(len, &why)?;
+        if recipe.gate.is_some() {
+            ensure!(dataset.context_dim > 0, "recipe: `gate`: {} has no `infos/context` to probe for", recipe.data.display());
+        }
+        let split = dataset.split(None);
+        let config = ModelConfig {
+            layout: dataset.layout,
+            plan_horizon: recipe.model.plan_horizon,
+            block_len: recipe.model.block_len,
+            obs_horizon: recipe.model.obs_horizon,
+            level_max: recipe.model.level_max,
+            latent: recipe.model.latent.clone(),
+            denoiser: recipe.model.denoiser.clone(),
+            state_clip: recipe.model.state_clip,
+            action_low: split.action_bounds.0.clone(),
+            action_high: split.action_bounds.1.clone(),
+            normalizer: split.normalizer.clone(),
+            refined: recipe.model.latent.is_some() && recipe.stage2.routing == LatentRouting::Matched,
+            latent_spread: 0.0,
+            restart: recipe.restart,
+            sampler: recipe.sampler.clone(),
+        };
+        Ok(Self { recipe, split, dataset_digest: dataset.digest, config })
+    }
+}
+
+/// Trains a recipe to the end, from where an earlier run in the same directory stopped.
+///
+/// # Errors
+/// If the data set or the recipe is wrong, the gate is never passed, the loss diverges, or the disk refuses.
+pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
+    let task = Task::new(recipe)?;
+    let dir = options.out.join(TRAINING_DIR);
+    let store = Store::new(&dir, Identity { recipe: task.recipe.to_toml(), dataset: task.dataset_digest.clone() });
+    let state = store.load()?;
+    let resumed = state.as_ref().map(|state| state.position);
+    let mut learner = match state {
+        Some(state) => Learner::resumed(&task, state)?,
+        None => Learner::fresh(&task, 0)?,
+    };
+    let log = Log::open(&dir, &learner.position, options.clock)?;
+    let (train, held_out) = (task.split.train.len(), task.split.held_out.len());
+    log.say(&format!("{}: {train} episodes to train on, {held_out} held out", task.recipe.data.display()));
+    if let Some(position) = resumed {
+        log.say(&format!("going on at {} step {}", position.stage.name(), position.step));
+    }
+    let mut crank = Crank { task: &task, store, log, out: &options.out, stop: options.stop, steps_left: options.stop_after_steps };
+    crank.run(&mut learner)
+}
+
+/// Turns the crank: steps, logs, checkpoints.
+struct Crank<'a> {
+    task: &'a Task,
+    store: Store,
+    log: Log,
+    out: &'a Path,
+    stop: Arc<AtomicBool>,
+    steps_left: Option<usize>,
+}
+
+impl Crank<'_> {
+    fn run(&mut self, learner: &mut Learner) -> Result<Outcome> {
+        loop {
+            let outcome = match learner.position.stage {
+                Stage::Latent => self.stage1(learner)?,
+                Stage::Refine => self.stage2(learner)?,
+                Stage::Done => {
+                    ship::ship(self.task, learner, self.out, &self.log)?;
+                    return Ok(Outcome::Finished);
+                }
+            };
+            if outcome == Outcome::Stopped {
+                self.log.say(&format!("stopped at {} step {}; the same command goes on", learner.position.stage.name(), learner.position.step));
+                return Ok(outcome);
+            }
+        }
+    }
+
+    fn stage1(&mut self, learner: &mut Learner) -> Result<Outcome> {
+        let task = self.task;
+        let (Some(elbo), Some(stage)) = (ElboTask::new(task), &task.recipe.stage1) else {
+            bail!("stage 1 of a recipe without latents: is a bug");
+        };
+        if self.turn(learner, stage.steps, |learner| elbo.step(learner))? == Outcome::Stopped {
+            return Ok(Outcome::Stopped);
+        }
+        if !self.passes_gate(learner)? {
+            let attempt = learner.position.attempt + 1;
+            let probes = std::mem::take(&mut learner.probes);
+            *learner = Learner { probes, ..Learner::fresh(task, attempt)? };
+        } else {
+            learner.enter(task, Stage::Refine)?;
+        }
+        self.store.save(&learner.snapshot())?;
+        Ok(Outcome::Finished)
+    }
+
+    /// Probes where the data have a context; without a gate everything passes.
+    fn passes_gate(&mut self, learner: &mut Learner) -> Result<bool> {
+        let task = self.task;
+        let Some(latent) = learner.networks.latent.as_ref().filter(|_| task.split.train[0].context_dim > 0) else { return Ok(true) };
+        let result = stage1::gate(task, latent)?;
+        self.log.write(&learner.position, &[("probe_filter", result.filter), ("probe_successor_state", result.successor_state)])?;
+        if let Some(probes) = learner.probes.as_array_mut() {
+            probes.push(serde_json::to_value(result)?);
+        }
+        let Some(gate) = &task.recipe.gate else { return Ok(true) };
+        if !result.passes(gate) && learner.position.attempt + 1 >= gate.tries {
+            return Err(gate_failure(gate, &learner.probes));
+        }
+        if !result.passes(gate) {
+            self.log.say("the probe is above the gate: stage 1 starts anew from another seed");
+        }
+        Ok(result.passes(gate))
+    }
+
+    fn stage2(&mut self, learner: &mut Learner) -> Result<Outcome> {
+        let refine = RefineTask::new(self.task);
+        let outcome = self.turn(learner, self.task.recipe.stage2.steps, |learner| refine.step(learner))?;
+        if outcome == Outcome::Finished {
+            learner.position.stage = Stage::Done;
+            self.store.save(&learner.snapshot())?;
+        }
+        Ok(outcome)
+    }
+
+    /// Steps until the stage has `steps`; the one loop of training.
+    fn turn(&mut self, learner: &mut Learner, steps: usize, mut step: impl FnMut(&mut Learner) -> Result<Scalars>) -> Result<Outcome> {
+        let recipe = &self.task.recipe;
+        self.log.begin(&learner.position, steps);
+        while learner.position.step < steps {
+            if self.should_stop() {
+                self.store.save(&learner.snapshot())?;
+                return Ok(Outcome::Stopped);
+            }
+            let scalars = step(learner)?;
+            if let Some((name, value)) = scalars.iter().find(|(_, value)| !value.is_finite()) {
+                let (stage, at) = (learner.position.stage.name(), learner.position.step);
+                bail!("{name} is {value} at {stage} step {at}; the last good state is kept in {}", self.out.join(TRAINING_DIR).display());
+            }
+            learner.position.step += 1;
+            self.log.step(&learner.position, recipe.log_every, &scalars)?;
+            if learner.position.step.is_multiple_of(recipe.checkpoint_every) {
+                self.checkpoint(learner)?;
+            }
+        }
+        Ok(Outcome::Finished)
+    }
+
+    /// The training state, and in stage 2 a checkpoint that can already be served.
+    fn checkpoint(&self, learner: &Learner) -> Result<()> {
+        self.store.save(&learner.snapshot())?;
+        if learner.position.stage == Stage::Refine {
+            ship::ship(self.task, learner, self.out, &self.log)?;
+        }
+        Ok(())
+    }
+
+    fn should_stop(&mut self) -> bool {
+        let spent = self.steps_left.is_some_and(|left| left == 0);
+        self.steps_left = self.steps_left.map(|left| left.saturating_sub(1));
+        spent || self.stop.load(Ordering::Relaxed)
+    }
+}
+
+fn gate_failure(gate: &Gate, probes: &serde_json::Value) -> anyhow::Error {
+    anyhow::anyhow!(
+        "stage 1 did not pass the gate (filter {}, successor_state {}) in {} tries: {probes}; more data or steps, or a wider gate, may help",
+        gate.filter,
+        gate.successor_state,
+        gate.tries
+    )
+}

@@ -1,0 +1,171 @@
+//! What the latent knows of the hidden context: a linear probe from its mean to the truth in the data (section 5 of the paper).
+
+use super::{
+    dataset::{
+        Episode,
+        window::{Seen, TokenRows},
+    },
+    ridge::{Ridge, Table, standardised_error},
+};
+use crate::model::latent::LatentModel;
+use anyhow::{Result, ensure};
+use serde::Serialize;
+
+/// Rows of one forward.
+const CHUNK: usize = 512;
+/// Penalty of the probe; its few latents do not need more than numerical safety.
+const LAMBDA: f64 = 1e-6;
+
+/// What the latent of c_t is inferred from, beside `block_len` whole tokens before t.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Evidence {
+    /// s_t, then the prior: what a decision at t has ("without the future token").
+    Filter,
+    /// x_t and the successor state s_{t+1}.
+    SuccessorState,
+    /// x_t and the whole successor token x_{t+1}.
+    Successor,
+}
+
+impl Evidence {
+    /// All of them, least first.
+    pub const ALL: [Self; 3] = [Self::Filter, Self::SuccessorState, Self::Successor];
+}
+
+/// Where features were taken: (episode, t).
+pub type Place = (usize, usize);
+
+/// Every `stride`-th place of each episode that has a successor, `stride` chosen for at most about `rows_max` places.
+pub fn places(episodes: &[Episode], rows_max: usize) -> Vec<Place> {
+    let total: usize = episodes.iter().map(|episode| episode.len().saturating_sub(1)).sum();
+    let stride = total.div_ceil(rows_max.max(1)).max(1);
+    let of = |(index, episode): (usize, &Episode)| (0..episode.len().saturating_sub(1)).map(move |t| (index, t)).collect::<Vec<_>>();
+    episodes.iter().enumerate().flat_map(of).step_by(stride).collect()
+}
+
+/// Latent means of c_t at these places: `(places, dim)`.
+///
+/// # Errors
+/// If a tensor operation fails.
+pub fn latent_means(latent: &LatentModel, episodes: &[Episode], places: &[Place], evidence: Evidence, block_len: usize) -> Result<Table> {
+    let mut out = Table::new(0);
+    for chunk in places.chunks(CHUNK) {
+        let Some(first) = chunk.first() else { break };
+        let mut rows = TokenRows::new(episodes[first.0].layout);
+        for (episode, t) in chunk {
+            let (episode, t) = (&episodes[*episode], *t as isize);
+            (t - block_len as isize..t).for_each(|past| rows.push(episode, past, Seen::ALL));
+            if evidence == Evidence::Filter {
+                rows.push(episode, t, Seen::STATE);
+            } else {
+                rows.push(episode, t, Seen::ALL);
+                rows.push(episode, t + 1, if evidence == Evidence::Successor { Seen::ALL } else { Seen::STATE });
+            }
+        }
+        let len = block_len + if evidence == Evidence::Filter { 1 } else { 2 };
+        let posterior = latent.infer(&rows.tokens(len)?)?;
+        let gaussian = if evidence == Evidence::Filter { latent.prior.predict(&posterior)? } else { posterior };
+        out.width = gaussian.mean.dim(1)?;
+        out.values.extend(gaussian.mean.flatten_all()?.to_vec1::<f32>()?.into_iter().map(f64::from));
+    }
+    Ok(out)
+}
+
+/// Root of the summed variances of all columns: the spread of the latent, the yardstick of a jump.
+pub fn spread(means: &Table) -> f64 {
+    let count = means.rows().max(1) as f64;
+    let column = |j: usize| means.values.iter().skip(j).step_by(means.width).copied();
+    let variance = |j: usize| {
+        let mean = column(j).sum::<f64>() / count;
+        column(j).map(|v| (v - mean).powi(2)).sum::<f64>() / count
+    };
+    (0..means.width).map(variance).sum::<f64>().sqrt()
+}
+
+/// One line of the probe's table.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Score {
+    /// What the estimate is made from: a latent, or ridge on the raw tokens (the ceiling).
+    pub source: &'static str,
+    /// What it saw.
+    pub evidence: Evidence,
+    /// Whole tokens before t.
+    pub block_len: usize,
+    /// The estimate at t is held against `context[t + shift]`.
+    pub shift: i32,
+    /// Standardised mean squared error on held-out episodes, where the whole block lies in the episode.
+    pub error: f64,
+    /// 1 - error.
+    pub r2: f64,
+    /// The same error over all steps, the first ones of an episode included.
+    pub error_all: f64,
+}
+
+/// Features of the places of a set of episodes.
+pub struct Features<'a> {
+    /// The episodes.
+    pub episodes: &'a [Episode],
+    /// Where.
+    pub places: Vec<Place>,
+    /// One row for each place.
+    pub table: Table,
+}
+
+impl Features<'_> {
+    /// Rows for which `context[t + shift]` exists and t is at least `from`, with that context.
+    fn aligned(&self, shift: i32, from: usize) -> (Table, Table) {
+        let dim = self.episodes.first().map_or(0, |episode| episode.context_dim);
+        let (mut rows, mut truth) = (Vec::new(), Table::new(dim));
+        for (row, (episode, t)) in self.places.iter().enumerate() {
+            let at = *t as i64 + i64::from(shift);
+            let inside = usize::try_from(at).ok().filter(|at| *at < self.episodes[*episode].len());
+            if let Some(at) = inside.filter(|_| *t >= from) {
+                rows.push(row);
+                truth.values.extend(self.episodes[*episode].context(at).iter().map(|value| f64::from(*value)));
+            }
+        }
+        (self.table.select(&rows), truth)
+    }
+}
+
+/// Fits on `fit`, where the block is whole, and measures on `test`: (error where the block is whole, error over all steps).
+pub fn score(fit: &Features, test: &Features, shift: i32, from: usize, lambda: f64) -> (f64, f64) {
+    let (x, y) = fit.aligned(shift, from);
+    let ridge = Ridge::fit(&x, &y, lambda);
+    let error = |from: usize| {
+        let (x, y) = test.aligned(shift, from);
+        standardised_error(&ridge.predict(&x), &y)
+    };
+    (error(from), error(0))
+}
+
+/// Training and held-out episodes of a probe, and how many places of each are used.
+pub struct Subjects<'a> {
+    /// The probe is fitted on these.
+    pub train: &'a [Episode],
+    /// And measured on these.
+    pub held_out: &'a [Episode],
+    /// At most about this many places of each.
+    pub rows_max: usize,
+}
+
+/// The linear probe of a latent model at one block length and evidence, over shifts.
+///
+/// # Errors
+/// If the data have no context, or a tensor operation fails.
+pub fn latent_probe(latent: &LatentModel, subjects: &Subjects, evidence: Evidence, block_len: usize, shifts: &[i32]) -> Result<Vec<Score>> {
+    let context_dim = subjects.train.first().map_or(0, |episode| episode.context_dim);
+    ensure!(context_dim > 0, "the data set has no `infos/context`, so there is no truth to probe for");
+    let features = |episodes| -> Result<Features> {
+        let places = places(episodes, subjects.rows_max);
+        let table = latent_means(latent, episodes, &places, evidence, block_len)?;
+        Ok(Features { episodes, places, table })
+    };
+    let (fit, test) = (features(subjects.train)?, features(subjects.held_out)?);
+    let line = |shift: &i32| {
+        let (error, error_all) = score(&fit, &test, *shift, block_len, LAMBDA);
+        Score { source: "latent", evidence, block_len, shift: *shift, error, r2: 1.0 - error, error_all }
+    };
+    Ok(shifts.iter().map(line).collect())
+}

@@ -1,0 +1,104 @@
+//! What `ada-trainer probe` and `ada-trainer inspect` print.
+
+use super::{
+    ceiling::ceiling,
+    dataset::hdf5,
+    probe::{Evidence, Score, Subjects, latent_probe},
+};
+use crate::model::checkpoint;
+use anyhow::{Context, Result, ensure};
+use serde_json::{Value, json};
+use std::path::Path;
+
+/// Places of each side that the probe uses.
+const ROWS: usize = 20_000;
+const SHIFTS: [i32; 3] = [-1, 0, 1];
+
+/// Probes a checkpoint against a data set: block lengths 1, 2, 4 and T_x, every evidence, shifts -1, 0, 1, and the ceiling.
+///
+/// # Errors
+/// If either cannot be read, they do not fit, the model has no latent, or the data no context.
+pub fn probe(dir: &Path, data: &Path) -> Result<Vec<Score>> {
+    let agent = checkpoint::load(dir)?;
+    let config = agent.config();
+    let latent = agent.networks().latent.as_ref().with_context(|| format!("{} has no latent to probe", dir.display()))?;
+    let dataset = hdf5::read(data)?;
+    ensure!(
+        dataset.layout == config.layout,
+        "{}: {} states and {} actions, but the checkpoint has {} and {}",
+        data.display(),
+        dataset.layout.state_dim,
+        dataset.layout.action_dim,
+        config.layout.state_dim,
+        config.layout.action_dim
+    );
+    dataset.require_len(config.block_len + 2, "the block length")?;
+    let split = dataset.split(Some(&config.normalizer));
+    let subjects = Subjects { train: &split.train, held_out: &split.held_out, rows_max: ROWS };
+    let mut block_lens = vec![1, 2, 4, config.block_len];
+    block_lens.retain(|len| *len <= config.block_len);
+    block_lens.sort_unstable();
+    block_lens.dedup();
+    let mut scores = Vec::new();
+    for block_len in &block_lens {
+        for evidence in Evidence::ALL {
+            scores.extend(latent_probe(latent, &subjects, evidence, *block_len, &SHIFTS)?);
+        }
+    }
+    scores.extend(ceiling(&subjects, &block_lens)?);
+    Ok(scores)
+}
+
+/// The probe as a table for people.
+pub fn probe_table(scores: &[Score]) -> String {
+    let head = "standardised mean squared error of a linear probe for the hidden context, on held-out episodes (1 - R2)\n\
+                source   evidence          block  shift    error      R2   error, all steps\n";
+    let line = |score: &Score| {
+        let evidence = format!("{:?}", score.evidence);
+        format!(
+            "{:<8} {evidence:<16} {:>6} {:>6} {:>8.4} {:>7.4} {:>8.4}\n",
+            score.source, score.block_len, score.shift, score.error, score.r2, score.error_all
+        )
+    };
+    let best = scores.iter().filter(|score| score.source == "latent").min_by(|a, b| a.error.total_cmp(&b.error));
+    let tail = best.map_or_else(String::new, |best| format!("least error of the latent at shift {}\n", best.shift));
+    head.to_string() + &scores.iter().map(line).collect::<String>() + &tail
+}
+
+/// Loads and checks a checkpoint and says what it is.
+///
+/// # Errors
+/// If the checkpoint is refused.
+pub fn inspect(dir: &Path) -> Result<Value> {
+    let agent = checkpoint::load(dir)?;
+    let (manifest, digest) = checkpoint::load_manifest(dir)?;
+    let parameters = |prefix: &str| -> usize {
+        let of = manifest.tensors.iter().filter(|(name, _)| name.starts_with(prefix));
+        of.map(|(_, tensor)| tensor.shape.iter().product::<usize>()).sum()
+    };
+    Ok(json!({
+        "digest": digest,
+        "parameters": {"latent": parameters("latent."), "denoiser": parameters("denoiser.")},
+        "config": agent.config(),
+        "provenance": manifest.provenance,
+    }))
+}
+
+/// [`inspect`] for people.
+pub fn inspect_text(value: &Value) -> String {
+    let (config, provenance) = (&value["config"], &value["provenance"]);
+    let mut text = format!("digest      {}\n", value["digest"].as_str().unwrap_or_default());
+    let pair = |name: &str, value: &Value| format!("{name:<11} {value}\n");
+    for key in ["layout", "plan_horizon", "block_len", "obs_horizon", "level_max", "latent", "denoiser", "refined", "latent_spread", "sampler"] {
+        text += &pair(key, &config[key]);
+    }
+    text += &pair("parameters", &value["parameters"]);
+    for key in ["dataset", "dataset_sha256", "seed", "metrics"] {
+        text += &pair(key, &provenance[key]);
+    }
+    text + "recipe\n" + &indent(provenance["recipe"].as_str().unwrap_or_default())
+}
+
+fn indent(text: &str) -> String {
+    text.lines().map(|line| format!("  {line}\n")).collect()
+}

@@ -1,0 +1,191 @@
+//! The training state on disk: everything a run needs to go on with the same bits as if it had never stopped.
+//!
+//! Batches are a function of (seed, stage, attempt, step), so no generator has a state to keep: variables, Adam's moments, the EMA
+//! and the position are all there is.
+
+use super::optimizer::{Adam, Ema};
+use crate::model::noise::Philox;
+use anyhow::{Context, Result, ensure};
+use candle_core::{Device, Tensor, Var};
+use serde::{Deserialize, Serialize};
+use std::{
+    collections::{BTreeMap, HashMap},
+    fs,
+    path::{Path, PathBuf},
+};
+
+const FILE: &str = "state.safetensors";
+const KEY: &str = "training";
+
+/// The stations of a run, in order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stage {
+    /// Latent identification.
+    Latent,
+    /// Denoise and refine.
+    Refine,
+    /// Nothing is left to train.
+    Done,
+}
+
+impl Stage {
+    /// As it stands in logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Latent => "stage1",
+            Self::Refine => "stage2",
+            Self::Done => "done",
+        }
+    }
+
+    /// The opposite of [`Self::name`].
+    pub fn named(name: &str) -> Option<Self> {
+        [Self::Latent, Self::Refine, Self::Done].into_iter().find(|stage| stage.name() == name)
+    }
+}
+
+/// How far a run is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Position {
+    /// Where.
+    pub stage: Stage,
+    /// How often stage 1 was restarted from another seed.
+    pub attempt: usize,
+    /// Steps of this stage that are done.
+    pub step: usize,
+}
+
+impl Position {
+    /// The randomness of the step to come: a stream of its own.
+    pub fn stream(&self, seed: u64) -> Philox {
+        Philox::named(seed, &format!("{}.{}.{}", self.stage.name(), self.attempt, self.step))
+    }
+}
+
+/// What a state belongs to; a state of another run is refused.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Identity {
+    /// The recipe as TOML, overrides included.
+    pub recipe: String,
+    /// SHA-256 of the data set.
+    pub dataset: String,
+}
+
+/// What is written beside the tensors.
+#[derive(Serialize, Deserialize)]
+struct Header {
+    identity: Identity,
+    position: Position,
+    adam_steps: u64,
+    probes: serde_json::Value,
+}
+
+/// A state read from disk.
+pub struct State {
+    /// How far it is.
+    pub position: Position,
+    /// Results of the gate so far.
+    pub probes: serde_json::Value,
+    /// Steps that the optimizer has counted.
+    pub adam_steps: u64,
+    /// `var.NAME`, `m.NAME`, `v.NAME`, `ema.NAME`.
+    pub tensors: BTreeMap<String, Tensor>,
+}
+
+/// What is saved.
+pub struct Snapshot<'a> {
+    /// How far the run is.
+    pub position: Position,
+    /// Results of the gate so far.
+    pub probes: &'a serde_json::Value,
+    /// All variables.
+    pub vars: &'a BTreeMap<String, Var>,
+    /// Their optimizer.
+    pub adam: &'a Adam,
+    /// Their average, in stage 2.
+    pub ema: Option<&'a Ema>,
+}
+
+/// The state of one run in its directory.
+pub struct Store {
+    path: PathBuf,
+    identity: Identity,
+}
+
+impl Store {
+    /// The store in `dir`.
+    pub fn new(dir: &Path, identity: Identity) -> Self {
+        Self { path: dir.join(FILE), identity }
+    }
+
+    /// The state, if there is one.
+    ///
+    /// # Errors
+    /// If it is of another recipe or data set, or cannot be read.
+    pub fn load(&self) -> Result<Option<State>> {
+        let path = self.path.display();
+        let bytes = match fs::read(&self.path) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(error).with_context(|| format!("cannot read {path}")),
+        };
+        let broken = || format!("{path} is not a training state; remove it to start anew");
+        let (_, metadata) = safetensors::SafeTensors::read_metadata(&bytes).with_context(broken)?;
+        let text = metadata.metadata().as_ref().and_then(|map| map.get(KEY)).with_context(broken)?;
+        let header: Header = serde_json::from_str(text).with_context(broken)?;
+        ensure!(
+            header.identity.dataset == self.identity.dataset,
+            "{path} was made with another data set; remove it to start anew, or choose another --out"
+        );
+        ensure!(
+            header.identity.recipe == self.identity.recipe,
+            "{path} was made with another recipe or seed; remove it to start anew, or choose another --out"
+        );
+        let tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu).with_context(broken)?;
+        Ok(Some(State {
+            position: header.position,
+            probes: header.probes,
+            adam_steps: header.adam_steps,
+            tensors: tensors.into_iter().collect(),
+        }))
+    }
+
+    /// Writes a state beside the old one and renames it: a kill at any moment leaves one of the two.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn save(&self, snapshot: &Snapshot) -> Result<()> {
+        let mut tensors: BTreeMap<String, Tensor> = BTreeMap::new();
+        let adam_steps = snapshot.adam.save(&mut tensors)?;
+        tensors.extend(snapshot.vars.iter().map(|(name, var)| (format!("var.{name}"), var.as_tensor().clone())));
+        if let Some(ema) = snapshot.ema {
+            tensors.extend(ema.tensors(snapshot.vars)?.into_iter().map(|(name, tensor)| (format!("ema.{name}"), tensor)));
+        }
+        let header =
+            Header { identity: self.identity.clone(), position: snapshot.position, adam_steps, probes: snapshot.probes.clone() };
+        let metadata = HashMap::from([(KEY.to_string(), serde_json::to_string(&header)?)]);
+        let bytes = safetensors::serialize(tensors.iter().map(|(name, tensor)| (name, tensor)), Some(metadata))?;
+        write_beside(&self.path, &bytes).with_context(|| format!("cannot write {}", self.path.display()))
+    }
+}
+
+fn write_beside(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let beside = path.with_extension("partial");
+    let mut file = fs::File::create(&beside)?;
+    std::io::Write::write_all(&mut file, bytes)?;
+    file.sync_all()?;
+    fs::rename(&beside, path)
+}
+
+/// Copies `var.NAME` of a state into the variables.
+///
+/// # Errors
+/// If one is missing or of another shape.
+pub fn restore_vars(vars: &BTreeMap<String, Var>, tensors: &BTreeMap<String, Tensor>) -> Result<()> {
+    for (name, var) in vars {
+        let tensor = tensors.get(&format!("var.{name}")).with_context(|| format!("the training state lacks {name}"))?;
+        var.set(tensor).with_context(|| format!("{name} in the training state"))?;
+    }
+    Ok(())
+}
