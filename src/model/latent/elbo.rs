@@ -67,8 +67,9 @@ impl LatentModel {
     /// The negative ELBO of a batch. The prior of c_t sees the posterior of c_{t-1} with its gradient (stage 1 keeps it); the first position
     /// has no predecessor in the block and only trains the decoder.
     ///
-    /// Residuals of each column are divided by their own detached mean square: the gradient is that of a Gaussian likelihood with fitted
-    /// variance. With a plain squared error (the paper) a weak but identifying column drowns in the strong ones.
+    /// Residuals of states are in units of their one-step change, so a weak but identifying column counts as much as a strong one; the
+    /// squared error itself, not its logarithm: under a logarithm (a fitted variance) it pays to code the process noise in the latent
+    /// (measured on Point-Wind-S: probe error .99 over four seeds, against .03 so).
     ///
     /// # Errors
     /// If shapes differ.
@@ -85,11 +86,10 @@ impl LatentModel {
             residual.sqr()?.broadcast_mul(&batch.valid.unsqueeze(2)?)?.sum((0, 1))?.broadcast_div(&count)
         };
         let (state_error, reward_error) = (column_error((change - target)?)?, column_error((reward - &now.reward)?)?);
-        let log_error = |error: &Tensor| (error + 1e-6)?.log()?.sum_all();
         let columns = state_error.dim(0)? as f64;
-        let rec = ((log_error(&state_error)? + log_error(&reward_error)?.affine(options.reward_weight, 0.0)?)?.affine(0.5 / columns, 0.0))?;
+        let rec = (state_error.sum_all()? + reward_error.sum_all()?.affine(options.reward_weight, 0.0)?)?.affine(1.0 / columns, 0.0)?;
         let kl = self.block_kl(&q, &batch.valid)?;
-        let loss = (rec + kl.affine(options.kl_weight / columns, 0.0)?)?;
+        let loss = (rec + kl.affine(options.kl_weight, 0.0)?)?;
         Ok(ElboTerms { loss, state_error: state_error.mean_all()?, reward_error: reward_error.mean_all()?, kl })
     }
 
