@@ -1,1 +1,97 @@
-fn main() {}
+//! `ada-server`: flags -> config -> serve.
+
+use ada_diffuser::serve::{Server, config::Config, telemetry};
+use anyhow::Context;
+use clap::Parser;
+use std::{env, net::SocketAddr, os::unix::process::CommandExt, path::PathBuf, process::Command};
+use tokio::signal::unix::{SignalKind, signal};
+
+/// Serves Ada-Diffuser models over gRPC and REST on one port.
+#[derive(Parser)]
+#[command(version)]
+struct Flags {
+    /// Settings as TOML; deploy/server.toml lists them all.
+    #[arg(long, env = "ADA_CONFIG", value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Address of both faces (server.listen).
+    #[arg(long)]
+    listen: Option<SocketAddr>,
+    /// Directory of the checkpoints (models.dir).
+    #[arg(long, value_name = "DIR")]
+    models: Option<PathBuf>,
+    /// Model of a client that names none (models.default).
+    #[arg(long, value_name = "NAME")]
+    default_model: Option<String>,
+    /// Any setting, e.g. engine.workers=2; may be repeated.
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE", value_parser = key_value)]
+    settings: Vec<(String, String)>,
+}
+
+fn key_value(text: &str) -> Result<(String, String), String> {
+    let (key, value) = text.split_once('=').ok_or("expected SECTION.KEY=VALUE")?;
+    Ok((key.to_owned(), value.to_owned()))
+}
+
+impl Flags {
+    /// Flags as settings, the named ones last.
+    fn settings(self) -> (Option<PathBuf>, Vec<(String, String)>) {
+        let Self { config, listen, models, default_model, mut settings } = self;
+        let named = [
+            ("server.listen", listen.map(|address| address.to_string())),
+            ("models.dir", models.map(|dir| dir.to_string_lossy().into_owned())),
+            ("models.default", default_model),
+        ];
+        settings.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
+        (config, settings)
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let flags = Flags::parse();
+    run_single_threaded_math();
+    let (file, settings) = flags.settings();
+    let config = Config::load(file.as_deref(), &settings)?;
+    telemetry::install_log(&config.telemetry);
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(config.server.io_threads).enable_all().build()?;
+    let served = runtime.block_on(async {
+        let shutdown = shutdown()?;
+        let server = Server::bind(config).await?;
+        tracing::info!(address = %server.address()?, "listening");
+        server.run(shutdown).await.context("ada-server")
+    });
+    // Whatever still runs after the hard end of the drain must not keep the process.
+    runtime.shutdown_background();
+    served
+}
+
+/// Each engine thread runs its batch alone, so the math library must not start threads of its own; and it reads /proc/cpuinfo at every matrix product
+/// unless told how many threads there are. It is told by the environment, which a process cannot safely change for itself: so the process is replaced by
+/// itself (same id, same arguments) with the variables set.
+fn run_single_threaded_math() {
+    const ALONE: [(&str, &str); 2] = [("RAYON_NUM_THREADS", "1"), ("CANDLE_NUM_THREADS", "1")];
+    if ALONE.iter().all(|(name, _)| env::var_os(name).is_some()) {
+        return;
+    }
+    let Ok(program) = env::current_exe() else { return };
+    let unset = ALONE.into_iter().filter(|(name, _)| env::var_os(name).is_none());
+    let error = Command::new(program).args(env::args_os().skip(1)).envs(unset).exec();
+    eprintln!("warning: could not restart with single-threaded math ({error}); serving will be slower");
+}
+
+/// Ready at the first SIGTERM or SIGINT; a second one ends the process at once.
+fn shutdown() -> anyhow::Result<impl Future<Output = ()>> {
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    Ok(async move {
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+        }
+        tokio::spawn(async move {
+            tokio::select! {
+                _ = terminate.recv() => {}
+                _ = interrupt.recv() => {}
+            }
+            std::process::exit(0);
+        });
+    })
+}

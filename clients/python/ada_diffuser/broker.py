@@ -78,7 +78,7 @@ class ChunkBroker:
         if self.chunk is not None:
             self._next = len(self.chunk.actions)
 
-    def reset(self, seed: int | None = None) -> None:
-        """A new episode in the same session."""
-        self.session.reset(seed)
+    def reset(self, seed: int | None = None, *, keep_history: bool = False) -> None:
+        """A new episode in the same session, see `Session.reset`. What was executed since the last act is not told any more."""
+        self.session.reset(seed, keep_history=keep_history)
         self.chunk, self._next, self._executed = None, 0, []

@@ -152,10 +152,10 @@ class Client:
     def _act(self, call: ActCall) -> Chunk:
         return self._retry.run(lambda: self._face.act(call, self._timeout_s))
 
-    def _reset(self, session_id: str, seed: int | None) -> SessionSummary:
+    def _reset(self, session_id: str, seed: int | None, keep_history: bool) -> SessionSummary:
         # An act that was given up here may still be in flight there, for a moment: worth the wait.
         return self._retry.run(
-            lambda: self._face.reset_session(session_id, seed, self._timeout_s),
+            lambda: self._face.reset_session(session_id, seed, keep_history, self._timeout_s),
             lambda error: error.retryable or isinstance(error, StepConflict),
         )
 
@@ -236,9 +236,12 @@ class Session:
             raise InvalidInput(f"step {chunk.step} of {chunk.session_id} is not the next of {self.session_id}")
         self._committed_step = chunk.step
 
-    def reset(self, seed: int | None = None) -> None:
-        """A new episode: committed step 0 again. Without `seed` the server draws one."""
-        summary = self._client._reset(self.session_id, seed)
+    def reset(self, seed: int | None = None, *, keep_history: bool = False) -> None:
+        """A new episode: committed step 0 again. Without `seed` the server draws one.
+
+        With `keep_history` the latent goes on looking back on the old episode, for a context that outlasts episodes.
+        """
+        summary = self._client._reset(self.session_id, seed, keep_history)
         self.seed, self._committed_step = summary.seed, summary.committed_step
 
     def summary(self) -> SessionSummary:

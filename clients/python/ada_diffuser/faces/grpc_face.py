@@ -52,8 +52,8 @@ class GrpcFace:
         request = agent_pb2.ActBatchRequest(acts=[_act_request(call) for call in calls])
         return [_result(result) for result in _call(self._agent.ActBatch, request, timeout_s).results]
 
-    def reset_session(self, session_id: str, seed: int | None, timeout_s: float) -> SessionSummary:
-        request = agent_pb2.ResetSessionRequest(session_id=session_id, seed=_uint64(seed, "seed"))
+    def reset_session(self, session_id: str, seed: int | None, keep_history: bool, timeout_s: float) -> SessionSummary:
+        request = agent_pb2.ResetSessionRequest(session_id=session_id, seed=_uint64(seed, "seed"), keep_history=keep_history)
         return _summary(_call(self._agent.ResetSession, request, timeout_s).session)
 
     def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:

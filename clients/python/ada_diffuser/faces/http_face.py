@@ -42,9 +42,9 @@ class HttpFace:
         body = {"acts": [{"session_id": call.session_id, **_act_body(call)} for call in calls]}
         return _read(_results, self._call("POST", "/v1/act:batch", body, timeout_s), "results")
 
-    def reset_session(self, session_id: str, seed: int | None, timeout_s: float) -> SessionSummary:
+    def reset_session(self, session_id: str, seed: int | None, keep_history: bool, timeout_s: float) -> SessionSummary:
         path = f"/v1/sessions/{_quoted(session_id)}/reset"
-        return _read(_summary, self._call("POST", path, _without_none(seed=seed), timeout_s), "session")
+        return _read(_summary, self._call("POST", path, _without_none(seed=seed, keep_history=keep_history or None), timeout_s), "session")
 
     def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:
         return _read(_summary, self._call("GET", f"/v1/sessions/{_quoted(session_id)}", None, timeout_s), "session")

@@ -119,7 +119,7 @@ def _captioned(frame: Image.Image, record: dict[str, NDArray[np.float32]], step:
         words.append("read out " + " ".join(f"{value:.1f}" for value in record["seen"][act]))
     taller = Image.new("RGB", (frame.width, frame.height + 18), "black")
     taller.paste(frame)
-    ImageDraw.Draw(taller).text((6, frame.height + 3), "    ".join(words), fill="white")
+    ImageDraw.Draw(taller).text((6, frame.height + 3), "  |  ".join(words), fill="white")
     return taller
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from ada_diffuser.rollout.readout import Readout
 from ada_diffuser.rollout.result import Episode, Evaluation
 
-#: Shown episodes stand side by side, at most so many.
+#: Shown episodes stand side by side, at most so many, and so many steps of each: a wind may turn every dozen steps.
 EPISODES_SHOWN = 3
+STEPS_SHOWN = 80
 
 
 def save_plot(result: Evaluation, readout: Readout | str, path: Path) -> None:
@@ -57,26 +58,27 @@ def _draw_context(axes: Any, result: Evaluation, readout: Readout | str) -> None
     offset = 0
     for n, episode in enumerate(result.episodes[first : first + EPISODES_SHOWN]):
         _draw_one_context(axes, episode, read, offset, labelled=n == 0)
-        offset += len(episode.rewards)
+        offset += min(STEPS_SHOWN, len(episode.rewards))
         axes.axvline(offset, color="0.8", linewidth=0.8)
-    axes.set(xlabel="step, episode after episode", ylabel="hidden context")
+    axes.set(xlabel=f"step, the first {STEPS_SHOWN} of each episode", ylabel="hidden context")
     title = f"true context, and read out of the latent (R² = {read.r2:.3f} on episodes not fitted)" if read else readout
     axes.set_title(title, fontsize=10)
     if axes.get_legend_handles_labels()[1]:
-        axes.legend(loc="upper right")
+        axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
 
 
 def _draw_one_context(axes: Any, episode: Episode, read: Readout | None, offset: int, *, labelled: bool) -> None:
     if not episode.contexts:
         return
-    true = np.array(episode.contexts)
+    true = np.array(episode.contexts[:STEPS_SHOWN])
     steps = offset + np.arange(len(true))
-    seen = read.of(episode) if read else None
+    shown = [step for step in episode.act_steps if step < STEPS_SHOWN]
+    seen = read.of(episode)[: len(shown)] if read else None
     for i in range(true.shape[1]):
         name = f" {i}" if true.shape[1] > 1 else ""
         axes.plot(steps, true[:, i], color=f"C{2 * i}", label=f"true{name}" if labelled else None)
         if seen is not None:
-            at = offset + np.array(episode.act_steps)
+            at = offset + np.array(shown)
             label = f"read out{name}" if labelled else None
             axes.plot(at, seen[:, i], ".-", color=f"C{2 * i + 1}", markersize=3, linewidth=0.8, label=label)
 

@@ -176,12 +176,14 @@ class ActBatchResponse(_message.Message):
     def __init__(self, results: _Optional[_Iterable[_Union[ActResult, _Mapping]]] = ...) -> None: ...
 
 class ResetSessionRequest(_message.Message):
-    __slots__ = ("session_id", "seed")
+    __slots__ = ("session_id", "seed", "keep_history")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
+    KEEP_HISTORY_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     seed: int
-    def __init__(self, session_id: _Optional[str] = ..., seed: _Optional[int] = ...) -> None: ...
+    keep_history: bool
+    def __init__(self, session_id: _Optional[str] = ..., seed: _Optional[int] = ..., keep_history: bool = ...) -> None: ...
 
 class ResetSessionResponse(_message.Message):
     __slots__ = ("session",)

@@ -1,0 +1,342 @@
+//! Every setting of the server, read once: file, then environment (`ADA__SECTION__KEY`), then flags; `deploy/server.toml` lists them all.
+
+use config::{Environment, File, FileFormat};
+use serde::{Deserialize, Serialize};
+use std::{net::SocketAddr, path::Path, path::PathBuf, thread};
+
+/// All settings; each section documents its own.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// The process: address, threads, end.
+    pub server: ServerConfig,
+    /// One connection: time limits and protocol bounds.
+    pub connection: ConnectionConfig,
+    /// One request.
+    pub limits: LimitsConfig,
+    /// The session table.
+    pub sessions: SessionsConfig,
+    /// The threads that run the networks.
+    pub engine: EngineConfig,
+    /// The checkpoints.
+    pub models: ModelsConfig,
+    /// What is logged.
+    pub telemetry: TelemetryConfig,
+}
+
+/// The process: address, threads, end.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ServerConfig {
+    /// Address of both faces.
+    pub listen: SocketAddr,
+    /// Threads of the I/O runtime; 0: one per core.
+    pub io_threads: usize,
+    /// Open connections; one more is answered 503 and closed.
+    pub connections_max: usize,
+    /// From the signal to end until connections are asked to leave; new work is refused (DRAINING) and `/readyz` fails, so that everyone can learn of it.
+    pub drain_notice_ms: u64,
+    /// From then on to the hard end of what still runs.
+    pub drain_timeout_ms: u64,
+}
+
+/// One connection: time limits and protocol bounds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ConnectionConfig {
+    /// Until the first bytes show whether it speaks HTTP/1 or HTTP/2.
+    pub preface_timeout_ms: u64,
+    /// Until a request's headers are complete (HTTP/1), the time between requests included.
+    pub header_read_timeout_ms: u64,
+    /// Until a REST body is complete.
+    pub body_read_timeout_ms: u64,
+    /// Bytes of all headers of a request.
+    pub header_bytes_max: u32,
+    /// Number of headers of a request (HTTP/1).
+    pub headers_max: usize,
+    /// Open HTTP/2 streams of one connection.
+    pub streams_max: u32,
+    /// HTTP/2 streams that the client has reset and that are not yet cleared away; more is taken as an attack.
+    pub pending_resets_max: usize,
+    /// HTTP/2 ping after so much silence.
+    pub keepalive_interval_ms: u64,
+    /// Close when a ping is not answered for so long.
+    pub keepalive_timeout_ms: u64,
+}
+
+/// One request.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LimitsConfig {
+    /// Bytes of one message, of either face.
+    pub message_bytes_max: usize,
+    /// Nesting of a JSON body.
+    pub json_depth_max: usize,
+    /// Acts of one ActBatch.
+    pub act_batch_len_max: usize,
+    /// Acts of one ActStream or WebSocket that are worked on at once; the next is read when one is answered.
+    pub stream_acts_max: usize,
+    /// Time for an act whose client named none.
+    pub act_deadline_ms: u64,
+    /// The longest time a client may ask for; more is cut to this.
+    pub act_deadline_ms_max: u64,
+}
+
+/// The session table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SessionsConfig {
+    /// Sessions at once; one more evicts the one that is idle for longest, or is refused (QUOTA).
+    pub len_max: usize,
+    /// Memory of all episodes together; treated like `len_max`.
+    pub bytes_max: usize,
+    /// A session that is not touched for so long expires, if its client named no other time.
+    pub ttl_ms: u64,
+    /// The longest time a client may ask for; more is refused.
+    pub ttl_ms_max: u64,
+    /// A session is evicted only when it was idle for so long.
+    pub evict_idle_ms: u64,
+    /// So long an ended session is answered with the reason of its end instead of "not found".
+    pub tombstone_ttl_ms: u64,
+    /// Ended sessions remembered; beyond it the oldest are forgotten.
+    pub tombstones_max: usize,
+    /// How often the table is searched for expired sessions.
+    pub reap_interval_ms: u64,
+}
+
+/// The threads that run the networks.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EngineConfig {
+    /// Inference threads, each with a batch of its own; 0: one per core.
+    pub workers: usize,
+    /// Acts that wait for a worker; one more is refused (QUEUE_FULL).
+    pub queue_len_max: usize,
+    /// Acts that share one network evaluation of a worker.
+    pub batch_len_max: usize,
+    /// What a refused client is told to wait.
+    pub retry_after_ms: u64,
+    /// A worker silent for longer makes `/livez` fail.
+    pub heartbeat_age_ms_max: u64,
+}
+
+/// The checkpoints.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ModelsConfig {
+    /// Directory whose sub-directories are checkpoints, named by them.
+    pub dir: PathBuf,
+    /// Model of a client that names none; it must be there.
+    pub default: String,
+}
+
+/// What is logged.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TelemetryConfig {
+    /// Filter, e.g. `info` or `ada_diffuser=debug,info`.
+    pub log: String,
+    /// Lines for people or for machines.
+    pub format: LogFormat,
+}
+
+/// How a log line looks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LogFormat {
+    /// For people.
+    Pretty,
+    /// One JSON object a line.
+    Json,
+}
+
+impl Default for ServerConfig {
+    fn default() -> Self {
+        Self { listen: SocketAddr::from(([127, 0, 0, 1], 7777)), io_threads: 0, connections_max: 4096, drain_notice_ms: 250, drain_timeout_ms: 10_000 }
+    }
+}
+
+impl Default for ConnectionConfig {
+    fn default() -> Self {
+        Self {
+            preface_timeout_ms: 5_000,
+            header_read_timeout_ms: 10_000,
+            body_read_timeout_ms: 10_000,
+            header_bytes_max: 16_384,
+            headers_max: 64,
+            streams_max: 128,
+            pending_resets_max: 128,
+            keepalive_interval_ms: 30_000,
+            keepalive_timeout_ms: 10_000,
+        }
+    }
+}
+
+impl Default for LimitsConfig {
+    fn default() -> Self {
+        Self {
+            message_bytes_max: 1 << 20,
+            json_depth_max: 64,
+            act_batch_len_max: 256,
+            stream_acts_max: 256,
+            act_deadline_ms: 30_000,
+            act_deadline_ms_max: 300_000,
+        }
+    }
+}
+
+impl Default for SessionsConfig {
+    fn default() -> Self {
+        Self {
+            len_max: 10_000,
+            bytes_max: 1 << 30,
+            ttl_ms: 600_000,
+            ttl_ms_max: 86_400_000,
+            evict_idle_ms: 60_000,
+            tombstone_ttl_ms: 600_000,
+            tombstones_max: 100_000,
+            reap_interval_ms: 1_000,
+        }
+    }
+}
+
+impl Default for EngineConfig {
+    fn default() -> Self {
+        Self { workers: 0, queue_len_max: 1024, batch_len_max: 32, retry_after_ms: 100, heartbeat_age_ms_max: 10_000 }
+    }
+}
+
+impl Default for ModelsConfig {
+    fn default() -> Self {
+        Self { dir: PathBuf::from("models"), default: "cheetah-wind-s".to_owned() }
+    }
+}
+
+impl Default for TelemetryConfig {
+    fn default() -> Self {
+        Self { log: "info".to_owned(), format: LogFormat::Pretty }
+    }
+}
+
+/// Why the settings were refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// Not readable, not TOML, an unknown key or a value of the wrong type.
+    #[error(transparent)]
+    Read(#[from] config::ConfigError),
+    /// A value outside its range.
+    #[error("{key}: {reason}")]
+    Invalid {
+        /// `section.key`.
+        key: &'static str,
+        /// What is allowed.
+        reason: &'static str,
+    },
+}
+
+impl Config {
+    /// Defaults < `file` < environment < `flags` (`("section.key", "value")`), validated.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or a key is unknown, or a value is of the wrong type or out of range.
+    pub fn load(file: Option<&Path>, flags: &[(String, String)]) -> Result<Self, ConfigError> {
+        let environment = Environment::with_prefix("ADA").prefix_separator("__").separator("__").try_parsing(true);
+        let mut builder = config::Config::builder();
+        if let Some(path) = file {
+            builder = builder.add_source(File::from(path).format(FileFormat::Toml));
+        }
+        builder = builder.add_source(environment);
+        for (key, value) in flags {
+            builder = builder.set_override(key, value.as_str())?;
+        }
+        builder.build()?.try_deserialize::<Self>()?.validated()
+    }
+
+    /// The same with 0 for "one per core" resolved.
+    ///
+    /// # Errors
+    /// If a value is out of range.
+    pub fn validated(mut self) -> Result<Self, ConfigError> {
+        let cores = thread::available_parallelism().map_or(1, usize::from);
+        for threads in [&mut self.server.io_threads, &mut self.engine.workers] {
+            *threads = if *threads == 0 { cores } else { *threads };
+        }
+        for (key, value) in self.positive() {
+            if value == 0 {
+                return Err(ConfigError::Invalid { key, reason: "must be at least 1" });
+            }
+        }
+        let range = |key, holds: bool, reason| if holds { Ok(()) } else { Err(ConfigError::Invalid { key, reason }) };
+        range("connection.header_bytes_max", self.connection.header_bytes_max >= 8192, "must be at least 8192")?;
+        range("sessions.ttl_ms", self.sessions.ttl_ms <= self.sessions.ttl_ms_max, "must be at most sessions.ttl_ms_max")?;
+        range("limits.json_depth_max", self.limits.json_depth_max <= 128, "must be at most 128")?;
+        let deadlines = self.limits.act_deadline_ms <= self.limits.act_deadline_ms_max;
+        range("limits.act_deadline_ms", deadlines, "must be at most limits.act_deadline_ms_max")?;
+        Ok(self)
+    }
+
+    /// Settings that make no sense as 0.
+    fn positive(&self) -> [(&'static str, u64); 22] {
+        let (connection, limits, sessions, engine) = (&self.connection, &self.limits, &self.sessions, &self.engine);
+        [
+            ("server.connections_max", self.server.connections_max as u64),
+            ("connection.preface_timeout_ms", connection.preface_timeout_ms),
+            ("connection.header_read_timeout_ms", connection.header_read_timeout_ms),
+            ("connection.body_read_timeout_ms", connection.body_read_timeout_ms),
+            ("connection.headers_max", connection.headers_max as u64),
+            ("connection.streams_max", connection.streams_max.into()),
+            ("connection.pending_resets_max", connection.pending_resets_max as u64),
+            ("connection.keepalive_interval_ms", connection.keepalive_interval_ms),
+            ("connection.keepalive_timeout_ms", connection.keepalive_timeout_ms),
+            ("limits.message_bytes_max", limits.message_bytes_max as u64),
+            ("limits.json_depth_max", limits.json_depth_max as u64),
+            ("limits.act_batch_len_max", limits.act_batch_len_max as u64),
+            ("limits.stream_acts_max", limits.stream_acts_max as u64),
+            ("limits.act_deadline_ms", limits.act_deadline_ms),
+            ("sessions.len_max", sessions.len_max as u64),
+            ("sessions.bytes_max", sessions.bytes_max as u64),
+            ("sessions.ttl_ms", sessions.ttl_ms),
+            ("sessions.reap_interval_ms", sessions.reap_interval_ms),
+            ("engine.queue_len_max", engine.queue_len_max as u64),
+            ("engine.batch_len_max", engine.batch_len_max as u64),
+            ("engine.retry_after_ms", engine.retry_after_ms),
+            ("engine.heartbeat_age_ms_max", engine.heartbeat_age_ms_max),
+        ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(text: &str, flags: &[(&str, &str)]) -> Result<Config, ConfigError> {
+        let file = tempfile::NamedTempFile::with_suffix(".toml").unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        let flags: Vec<_> = flags.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
+        Config::load(Some(file.path()), &flags)
+    }
+
+    /// `deploy/server.toml` holds every key with its default, and nothing else.
+    #[test]
+    fn deploy_file_lists_every_default() {
+        let listed: toml::Value = toml::from_str(include_str!("../../deploy/server.toml")).unwrap();
+        assert_eq!(listed, toml::Value::try_from(Config::default()).unwrap());
+    }
+
+    #[test]
+    fn flags_beat_the_file() {
+        let text = "[engine]\nworkers = 3\nbatch_len_max = 5\n[server]\nlisten = \"127.0.0.1:1\"\n";
+        let config = load(text, &[("engine.workers", "4"), ("server.listen", "127.0.0.1:2")]).unwrap();
+        assert_eq!((config.engine.workers, config.engine.batch_len_max, config.server.listen.port()), (4, 5, 2));
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        let message = |text, flags: &[(&str, &str)]| load(text, flags).unwrap_err().to_string();
+        assert!(message("[engine]\nworker = 3\n", &[]).contains("worker"));
+        assert!(message("", &[("engine.nothing", "1")]).contains("nothing"));
+        assert!(message("[engine]\nworkers = \"many\"\n", &[]).contains("many"));
+        assert_eq!(message("[engine]\nqueue_len_max = 0\n", &[]), "engine.queue_len_max: must be at least 1");
+        assert_eq!(message("[sessions]\nttl_ms = 90000000\n", &[]), "sessions.ttl_ms: must be at most sessions.ttl_ms_max");
+    }
+}

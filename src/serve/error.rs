@@ -1,0 +1,272 @@
+//! The one error of the service. Each face has its own table from it (`grpc/status.rs`, `http/problem.rs`); the words a client acts on stand here.
+
+use crate::model::agent::AgentError;
+use uuid::Uuid;
+
+/// Why a request was not done; every variant leaves the session as it was.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ServiceError {
+    /// The request is wrong and stays wrong: correct `field`.
+    #[error("{field}: {reason}")]
+    Invalid {
+        /// What kind of thing is wrong.
+        part: Part,
+        /// Path of the field, e.g. `observation.executed[2].action`.
+        field: String,
+        /// What is wrong and what is expected.
+        reason: String,
+    },
+    /// Go on from `committed`.
+    #[error("step {step} is neither {committed} nor {next}", next = committed + 1)]
+    StepOutOfOrder {
+        /// What was sent.
+        step: u64,
+        /// Where the session stands.
+        committed: u64,
+    },
+    /// Wait for the act in flight.
+    #[error("an act is in flight; the committed step is {committed}")]
+    SessionBusy {
+        /// Where the session stands.
+        committed: u64,
+    },
+    /// This step belongs to another observation.
+    #[error("step {step} was sent before with another observation")]
+    StepPayloadMismatch {
+        /// What was sent.
+        step: u64,
+        /// Where the session stands.
+        committed: u64,
+    },
+    /// Open a session.
+    #[error("no such session")]
+    SessionNotFound,
+    /// Open a session: this one was idle for too long.
+    #[error("the session has expired")]
+    SessionExpired,
+    /// Open a session: this one gave its place to others.
+    #[error("the session was evicted while idle to make room")]
+    SessionEvicted,
+    /// See the list of models.
+    #[error("no model {model:?}")]
+    ModelNotFound {
+        /// What was asked for.
+        model: String,
+    },
+    /// Send less.
+    #[error("{what} exceeds {limit}")]
+    TooLarge {
+        /// What is too large, with its unit.
+        what: &'static str,
+        /// The bound.
+        limit: usize,
+    },
+    /// The same again, later.
+    #[error("the queue is full")]
+    QueueFull {
+        /// When to try again.
+        retry_after_ms: u64,
+    },
+    /// The same again, later, or close sessions.
+    #[error("no room for another session")]
+    Quota {
+        /// When to try again.
+        retry_after_ms: u64,
+    },
+    /// The same again, with more time.
+    #[error("the deadline passed ({stage})")]
+    Deadline {
+        /// How far the act had come.
+        stage: Stage,
+    },
+    /// The same again, elsewhere or later.
+    #[error("the server is shutting down")]
+    Draining {
+        /// When to try again.
+        retry_after_ms: u64,
+    },
+    /// The same again, later.
+    #[error("the models are being loaded")]
+    NotReady {
+        /// When to try again.
+        retry_after_ms: u64,
+    },
+    /// The network's output was NaN or infinite.
+    #[error("the model's output is not finite ({id})")]
+    NonFiniteOutput {
+        /// To find it in the log.
+        id: Uuid,
+    },
+    /// A thread of the engine panicked over this act.
+    #[error("internal error ({id})")]
+    EnginePanic {
+        /// To find it in the log.
+        id: Uuid,
+    },
+    /// Anything else that is our fault.
+    #[error("internal error ({id})")]
+    Internal {
+        /// To find it in the log.
+        id: Uuid,
+    },
+}
+
+/// What kind of thing is wrong with an invalid request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// The message of an act.
+    Observation,
+    /// Sampler options.
+    Options,
+    /// Any other request.
+    Request,
+}
+
+/// How far an act had come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// Not yet in the queue.
+    Admission,
+    /// Waiting for a worker.
+    Queue,
+    /// Between network evaluations.
+    Compute,
+}
+
+impl Stage {
+    /// The word in metrics and messages.
+    pub fn word(self) -> &'static str {
+        match self {
+            Stage::Admission => "admission",
+            Stage::Queue => "queue",
+            Stage::Compute => "compute",
+        }
+    }
+}
+
+impl std::fmt::Display for Stage {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.word())
+    }
+}
+
+impl ServiceError {
+    /// An invalid field.
+    pub fn invalid(part: Part, field: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self::Invalid { part, field: field.into(), reason: reason.into() }
+    }
+
+    /// Our fault: `cause` goes to the log, only its id to the client.
+    pub fn internal(cause: &dyn std::fmt::Display) -> Self {
+        let id = Uuid::new_v4();
+        tracing::error!(%id, %cause, "internal error");
+        Self::Internal { id }
+    }
+
+    /// What the model said, in the words of the service.
+    pub fn from_agent(error: AgentError) -> Self {
+        match error {
+            AgentError::InvalidObservation { field, reason } => Self::invalid(Part::Observation, format!("observation.{field}"), reason),
+            AgentError::InvalidOptions { field, reason } => Self::invalid(Part::Options, format!("options.{field}"), reason),
+            AgentError::NonFinite => {
+                let id = Uuid::new_v4();
+                tracing::error!(%id, "the network's output is not finite");
+                metrics::counter!("ada_nonfinite_total", "where" => "denoiser").increment(1);
+                Self::NonFiniteOutput { id }
+            }
+            error @ AgentError::Tensor(_) => Self::internal(&error),
+        }
+    }
+
+    /// The fixed word a client acts on.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::Invalid { part: Part::Observation, .. } => "OBSERVATION_INVALID",
+            Self::Invalid { part: Part::Options, .. } => "OPTIONS_INVALID",
+            Self::Invalid { part: Part::Request, .. } => "REQUEST_INVALID",
+            Self::StepOutOfOrder { .. } => "STEP_OUT_OF_ORDER",
+            Self::SessionBusy { .. } => "SESSION_BUSY",
+            Self::StepPayloadMismatch { .. } => "STEP_PAYLOAD_MISMATCH",
+            Self::SessionNotFound => "SESSION_NOT_FOUND",
+            Self::SessionExpired => "SESSION_EXPIRED",
+            Self::SessionEvicted => "SESSION_EVICTED",
+            Self::ModelNotFound { .. } => "MODEL_NOT_FOUND",
+            Self::TooLarge { .. } => "TOO_LARGE",
+            Self::QueueFull { .. } => "QUEUE_FULL",
+            Self::Quota { .. } => "QUOTA",
+            Self::Deadline { stage: Stage::Admission } => "DEADLINE_ADMISSION",
+            Self::Deadline { stage: Stage::Queue } => "DEADLINE_QUEUE",
+            Self::Deadline { stage: Stage::Compute } => "DEADLINE_COMPUTE",
+            Self::Draining { .. } => "DRAINING",
+            Self::NotReady { .. } => "NOT_READY",
+            Self::NonFiniteOutput { .. } => "NONFINITE_OUTPUT",
+            Self::EnginePanic { .. } => "ENGINE_PANIC",
+            Self::Internal { .. } => "INTERNAL",
+        }
+    }
+
+    /// Path of the field at fault.
+    pub fn field(&self) -> Option<&str> {
+        if let Self::Invalid { field, .. } = self { Some(field) } else { None }
+    }
+
+    /// Where the session stands, for errors about steps.
+    pub fn committed_step(&self) -> Option<u64> {
+        match self {
+            Self::StepOutOfOrder { committed, .. } | Self::SessionBusy { committed } | Self::StepPayloadMismatch { committed, .. } => {
+                Some(*committed)
+            }
+            _ => None,
+        }
+    }
+
+    /// When to try the same again, for errors that pass by themselves.
+    pub fn retry_after_ms(&self) -> Option<u64> {
+        match self {
+            Self::QueueFull { retry_after_ms }
+            | Self::Quota { retry_after_ms }
+            | Self::Draining { retry_after_ms }
+            | Self::NotReady { retry_after_ms } => Some(*retry_after_ms),
+            _ => None,
+        }
+    }
+
+    /// To find an internal error in the log.
+    pub fn error_id(&self) -> Option<Uuid> {
+        match self {
+            Self::NonFiniteOutput { id } | Self::EnginePanic { id } | Self::Internal { id } => Some(*id),
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+impl ServiceError {
+    /// One of each kind with its codes in both tables and its word, as service.md lists them: (error, gRPC, HTTP, reason).
+    pub fn table() -> Vec<(Self, i32, u16, &'static str)> {
+        let (id, retry_after_ms, committed, step) = (Uuid::nil(), 1500, 3, 9);
+        vec![
+            (Self::invalid(Part::Observation, "observation.state", "short"), 3, 400, "OBSERVATION_INVALID"),
+            (Self::invalid(Part::Options, "options.eta", "2"), 3, 400, "OPTIONS_INVALID"),
+            (Self::invalid(Part::Request, "ttl_ms", "0"), 3, 400, "REQUEST_INVALID"),
+            (Self::StepOutOfOrder { step, committed }, 10, 409, "STEP_OUT_OF_ORDER"),
+            (Self::SessionBusy { committed }, 10, 409, "SESSION_BUSY"),
+            (Self::StepPayloadMismatch { step, committed }, 9, 422, "STEP_PAYLOAD_MISMATCH"),
+            (Self::SessionNotFound, 5, 404, "SESSION_NOT_FOUND"),
+            (Self::SessionExpired, 5, 410, "SESSION_EXPIRED"),
+            (Self::SessionEvicted, 5, 410, "SESSION_EVICTED"),
+            (Self::ModelNotFound { model: "x".into() }, 5, 404, "MODEL_NOT_FOUND"),
+            (Self::TooLarge { what: "bytes", limit: 1 }, 8, 413, "TOO_LARGE"),
+            (Self::QueueFull { retry_after_ms }, 8, 429, "QUEUE_FULL"),
+            (Self::Quota { retry_after_ms }, 8, 429, "QUOTA"),
+            (Self::Deadline { stage: Stage::Admission }, 4, 504, "DEADLINE_ADMISSION"),
+            (Self::Deadline { stage: Stage::Queue }, 4, 504, "DEADLINE_QUEUE"),
+            (Self::Deadline { stage: Stage::Compute }, 4, 504, "DEADLINE_COMPUTE"),
+            (Self::Draining { retry_after_ms }, 14, 503, "DRAINING"),
+            (Self::NotReady { retry_after_ms }, 14, 503, "NOT_READY"),
+            (Self::NonFiniteOutput { id }, 13, 500, "NONFINITE_OUTPUT"),
+            (Self::EnginePanic { id }, 13, 500, "ENGINE_PANIC"),
+            (Self::Internal { id }, 13, 500, "INTERNAL"),
+        ]
+    }
+}

@@ -1,0 +1,205 @@
+//! Messages <-> domain. Every message is destructured in full, so that a new field cannot be forgotten here.
+
+use super::pb;
+use crate::{
+    model::agent::{Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start},
+    serve::{
+        error::{Part, ServiceError},
+        registry::Model,
+        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, OptionsPatch},
+        session::{Answer, Summary, Timings},
+    },
+};
+use std::time::Duration;
+
+type Checked<T> = Result<T, ServiceError>;
+
+pub fn open_request(request: pb::OpenSessionRequest) -> Checked<OpenRequest> {
+    let pb::OpenSessionRequest { model, seed, options, ttl_ms } = request;
+    Ok(OpenRequest { model, seed, options: options.map_or(Ok(OptionsPatch::default()), options_patch)?, ttl_ms })
+}
+
+fn options_patch(options: pb::SamplerOptions) -> Checked<OptionsPatch> {
+    let pb::SamplerOptions { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = options;
+    let size = |value: Option<u32>| value.map(|value| value as usize);
+    let latent = latent.map(latent_mode).transpose()?;
+    Ok(OptionsPatch { streaming, action_horizon: size(action_horizon), sub_steps: size(sub_steps), eta, temperature, kappa, latent })
+}
+
+fn latent_mode(mode: i32) -> Checked<LatentMode> {
+    match pb::LatentMode::try_from(mode) {
+        Ok(pb::LatentMode::Mean) => Ok(LatentMode::Mean),
+        Ok(pb::LatentMode::Sample) => Ok(LatentMode::Sample),
+        Ok(pb::LatentMode::Unspecified) | Err(_) => {
+            Err(ServiceError::invalid(Part::Options, "options.latent", format!("{mode} is neither LATENT_MODE_MEAN nor LATENT_MODE_SAMPLE")))
+        }
+    }
+}
+
+/// `patience`: what is left of the call's own timeout.
+pub fn act_request(request: pb::ActRequest, patience: Option<Duration>) -> Result<ActRequest, ActResult> {
+    let pb::ActRequest { session_id, step, observation, deadline_ms, want_planned_states } = request;
+    let deadline = deadline_ms.map(|ms| Duration::from_millis(ms.into())).into_iter().chain(patience).min();
+    match observation {
+        Some(observation) => {
+            let observation = self::observation(observation);
+            Ok(ActRequest { session_id, step, observation, deadline, want_planned_states, face: Face::Grpc })
+        }
+        None => {
+            let result = Err(ServiceError::invalid(Part::Observation, "observation", "is missing"));
+            Err(ActResult { session_id, step, result })
+        }
+    }
+}
+
+fn observation(observation: pb::Observation) -> Observation {
+    let pb::Observation { state, executed } = observation;
+    let vector = |pb::Vector { values }| values;
+    let executed = executed.into_iter().map(|pb::Executed { state, action, reward }| Executed {
+        state: state.map(vector),
+        action: action.map(vector),
+        reward,
+    });
+    Observation { state, executed: executed.collect() }
+}
+
+pub fn list_request(request: pb::ListSessionsRequest) -> ListRequest {
+    let pb::ListSessionsRequest { page_size, page_token, model } = request;
+    ListRequest { page_size: page_size as usize, page_token, model }
+}
+
+pub fn act_response(acted: &Acted) -> pb::ActResponse {
+    let Acted { answer, replayed, want_planned_states } = acted;
+    let Answer { session, step, chunk, timings, model, model_digest } = &**answer;
+    let Chunk { actions, planned_states, latent_mean, latent_log_var, predicted_state, evaluations, start } = chunk;
+    let (start, renoised_rungs) = self::start(*start);
+    pb::ActResponse {
+        session_id: session.to_string(),
+        step: *step,
+        replayed: *replayed,
+        actions: Some(matrix(actions)),
+        planned_states: want_planned_states.then(|| matrix(planned_states)),
+        latent_mean: latent_mean.clone(),
+        latent_log_var: latent_log_var.clone(),
+        predicted_state: predicted_state.clone(),
+        evaluations: *evaluations,
+        start: start.into(),
+        renoised_rungs,
+        timings: Some(self::timings(timings)),
+        model: model.to_string(),
+        model_digest: model_digest.clone(),
+        degraded: false,
+    }
+}
+
+fn start(start: Start) -> (pb::Start, u32) {
+    match start {
+        Start::Cold => (pb::Start::Cold, 0),
+        Start::Warm => (pb::Start::Warm, 0),
+        Start::Renoised(rungs) => (pb::Start::Renoised, rungs),
+    }
+}
+
+fn matrix(rows: &[Vec<f32>]) -> pb::Matrix {
+    let columns = rows.first().map_or(0, Vec::len);
+    pb::Matrix { values: rows.concat(), rows: rows.len() as u32, columns: columns as u32 }
+}
+
+fn timings(timings: &Timings) -> pb::Timings {
+    let Timings { queue, compute, commit, total } = timings;
+    let us = |time: &Duration| time.as_micros() as u64;
+    pb::Timings { queue_us: us(queue), compute_us: us(compute), commit_us: us(commit), total_us: us(total) }
+}
+
+pub fn act_result(result: ActResult) -> pb::ActResult {
+    let ActResult { session_id, step, result } = result;
+    let result = match result {
+        Ok(acted) => pb::act_result::Result::Response(act_response(&acted)),
+        Err(error) => pb::act_result::Result::Error(self::error(&error)),
+    };
+    pb::ActResult { session_id, step, result: Some(result) }
+}
+
+fn error(error: &ServiceError) -> pb::Error {
+    pb::Error {
+        code: super::status::code(error).into(),
+        reason: error.reason().to_owned(),
+        message: error.to_string(),
+        field: error.field().unwrap_or_default().to_owned(),
+        committed_step: error.committed_step(),
+        retry_after_ms: error.retry_after_ms(),
+        error_id: error.error_id().map(|id| id.to_string()).unwrap_or_default(),
+    }
+}
+
+pub fn session(summary: Summary) -> pb::Session {
+    let Summary { id, model, model_digest, seed, committed_step, episode, options, latent, age, idle, ttl, state_bytes, busy } = summary;
+    let (latent_mean, latent_log_var) = latent.unwrap_or_default();
+    let ms = |time: Duration| time.as_millis() as u64;
+    pb::Session {
+        session_id: id.to_string(),
+        model: model.to_string(),
+        model_digest,
+        seed,
+        committed_step,
+        episode,
+        options: Some(sampler_options(&options)),
+        latent_mean,
+        latent_log_var,
+        age_ms: ms(age),
+        idle_ms: ms(idle),
+        ttl_ms: ms(ttl),
+        state_bytes: state_bytes as u64,
+        busy,
+    }
+}
+
+fn sampler_options(options: &SamplerOptions) -> pb::SamplerOptions {
+    let SamplerOptions { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = options;
+    let latent = match latent {
+        LatentMode::Mean => pb::LatentMode::Mean,
+        LatentMode::Sample => pb::LatentMode::Sample,
+    };
+    pb::SamplerOptions {
+        streaming: Some(*streaming),
+        action_horizon: Some(*action_horizon as u32),
+        sub_steps: Some(*sub_steps as u32),
+        eta: Some(*eta),
+        temperature: Some(*temperature),
+        kappa: Some(*kappa),
+        latent: Some(latent.into()),
+    }
+}
+
+pub fn model(model: &Model) -> pb::Model {
+    let Model { name, agent, is_default } = model;
+    let Spec {
+        layout,
+        plan_horizon,
+        block_len,
+        obs_horizon,
+        latent_dim,
+        level_max,
+        action_low,
+        action_high,
+        sampler,
+        refined,
+        digest,
+    } = agent.spec();
+    pb::Model {
+        name: name.to_string(),
+        digest: digest.clone(),
+        is_default: *is_default,
+        state_dim: layout.state_dim as u32,
+        action_dim: layout.action_dim as u32,
+        plan_horizon: *plan_horizon as u32,
+        block_len: *block_len as u32,
+        obs_horizon: *obs_horizon as u32,
+        latent_dim: *latent_dim as u32,
+        level_max: *level_max as u32,
+        action_low: action_low.clone(),
+        action_high: action_high.clone(),
+        sampler: Some(sampler_options(sampler)),
+        refined: *refined,
+    }
+}

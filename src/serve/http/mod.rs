@@ -1,0 +1,24 @@
+//! The REST face: JSON in, JSON out; the service does the rest.
+
+mod body;
+mod json;
+mod problem;
+mod routes;
+mod stream;
+
+pub use crate::serve::listener::Gate;
+pub use problem::Problem;
+pub use routes::{openapi, router};
+
+use crate::serve::service::Service;
+use metrics_exporter_prometheus::PrometheusHandle;
+use std::sync::Arc;
+
+/// What the handlers stand on.
+#[derive(Clone)]
+pub struct State {
+    /// The core.
+    pub service: Arc<Service>,
+    /// Renders `/metrics`.
+    pub metrics: PrometheusHandle,
+}

@@ -1,0 +1,124 @@
+//! The error table of the REST face: RFC 9457 problems.
+
+use crate::serve::error::ServiceError;
+use axum::{
+    http::{HeaderValue, StatusCode, header},
+    response::{IntoResponse, Response},
+};
+use serde::Serialize;
+use utoipa::ToSchema;
+
+/// An error as `application/problem+json`.
+#[derive(Clone, Debug, Serialize, ToSchema)]
+pub struct Problem {
+    /// Always `about:blank`.
+    r#type: &'static str,
+    /// The status in words.
+    title: &'static str,
+    /// The HTTP status.
+    status: u16,
+    /// A fixed word to act on.
+    reason: &'static str,
+    /// For people.
+    detail: String,
+    /// Path of the offending field.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    field: Option<String>,
+    /// Where the session stands.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    committed_step: Option<u64>,
+    /// Try the same again after this time.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    retry_after_ms: Option<u64>,
+    /// To find an internal error in the server's log.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error_id: Option<String>,
+}
+
+/// Status of an error.
+pub fn status(error: &ServiceError) -> StatusCode {
+    match error {
+        ServiceError::Invalid { .. } => StatusCode::BAD_REQUEST,
+        ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } => StatusCode::CONFLICT,
+        ServiceError::StepPayloadMismatch { .. } => StatusCode::UNPROCESSABLE_ENTITY,
+        ServiceError::SessionNotFound | ServiceError::ModelNotFound { .. } => StatusCode::NOT_FOUND,
+        ServiceError::SessionExpired | ServiceError::SessionEvicted => StatusCode::GONE,
+        ServiceError::TooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
+        ServiceError::QueueFull { .. } | ServiceError::Quota { .. } => StatusCode::TOO_MANY_REQUESTS,
+        ServiceError::Deadline { .. } => StatusCode::GATEWAY_TIMEOUT,
+        ServiceError::Draining { .. } | ServiceError::NotReady { .. } => StatusCode::SERVICE_UNAVAILABLE,
+        ServiceError::NonFiniteOutput { .. } | ServiceError::EnginePanic { .. } | ServiceError::Internal { .. } => {
+            StatusCode::INTERNAL_SERVER_ERROR
+        }
+    }
+}
+
+impl Problem {
+    /// A problem of the face itself.
+    pub fn new(status: StatusCode, reason: &'static str, detail: &str) -> Self {
+        Self {
+            r#type: "about:blank",
+            title: status.canonical_reason().unwrap_or("Error"),
+            status: status.as_u16(),
+            reason,
+            detail: detail.to_owned(),
+            field: None,
+            committed_step: None,
+            retry_after_ms: None,
+            error_id: None,
+        }
+    }
+}
+
+impl From<&ServiceError> for Problem {
+    fn from(error: &ServiceError) -> Self {
+        Self {
+            field: error.field().map(str::to_owned),
+            committed_step: error.committed_step(),
+            retry_after_ms: error.retry_after_ms(),
+            error_id: error.error_id().map(|id| id.to_string()),
+            ..Self::new(status(error), error.reason(), &error.to_string())
+        }
+    }
+}
+
+impl From<ServiceError> for Problem {
+    fn from(error: ServiceError) -> Self {
+        Self::from(&error)
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+        let retry_after_s = self.retry_after_ms.map(|ms| ms.div_ceil(1000));
+        let mut response = (status, axum::Json(self)).into_response();
+        let headers = response.headers_mut();
+        headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        if let Some(seconds) = retry_after_s {
+            headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        }
+        response
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_row_of_the_table() {
+        for (error, _, http, reason) in ServiceError::table() {
+            let problem = serde_json::to_value(Problem::from(&error)).unwrap();
+            assert_eq!((problem["status"].as_u64(), problem["reason"].as_str()), (Some(http.into()), Some(reason)), "{error:?}");
+            assert_eq!(problem["field"].as_str(), error.field(), "{error:?}");
+            assert_eq!(problem["committed_step"].as_u64(), error.committed_step(), "{error:?}");
+            assert_eq!(problem.get("error_id").is_some(), http == 500, "{error:?}");
+            let response = Problem::from(&error).into_response();
+            assert_eq!(response.status().as_u16(), http);
+            assert_eq!(response.headers()["content-type"], "application/problem+json");
+            let retry = response.headers().get("retry-after").map(|value| value.to_str().unwrap().to_owned());
+            assert_eq!(retry, error.retry_after_ms().map(|_| "2".to_owned()), "seconds, rounded up: {error:?}");
+        }
+    }
+}

@@ -1,0 +1,198 @@
+//! The routes and their handlers; `/openapi.json` is made from them.
+
+use super::{
+    Gate, State,
+    body::{bytes, parse},
+    json::{
+        ActAnswer, ActBody, BatchAnswer, BatchBody, ListQuery, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer, OpenBody, ResetBody,
+    },
+    problem::Problem,
+    stream,
+};
+use crate::serve::{
+    error::{Part, ServiceError},
+    request::{ActResult, ListRequest},
+};
+use axum::{
+    Extension, Json, Router,
+    body::Body,
+    extract::{MatchedPath, Path, Query, Request, State as Shared, WebSocketUpgrade, rejection::QueryRejection, ws::rejection::WebSocketUpgradeRejection},
+    http::StatusCode,
+    middleware::{self, Next},
+    response::{IntoResponse, Response},
+    routing,
+};
+use serde::de::DeserializeOwned;
+use utoipa::OpenApi;
+use utoipa_axum::{router::OpenApiRouter, routes};
+
+type Answer<T> = Result<Json<T>, Problem>;
+
+#[derive(OpenApi)]
+#[openapi(info(title = "Ada-Diffuser", description = "The verbs of an episode; see clients/http/README.md. Errors are application/problem+json."))]
+struct Api;
+
+fn documented() -> OpenApiRouter<State> {
+    OpenApiRouter::with_openapi(Api::openapi())
+        .routes(routes!(open_session, list_sessions))
+        .routes(routes!(get_session, close_session))
+        .routes(routes!(reset_session))
+        .routes(routes!(act))
+        .routes(routes!(act_stream))
+        .routes(routes!(act_batch))
+        .routes(routes!(list_models))
+        .routes(routes!(get_model))
+        .routes(routes!(livez))
+        .routes(routes!(readyz))
+        .routes(routes!(metrics))
+}
+
+/// The description of the face, as `/openapi.json` gives it.
+pub fn openapi() -> utoipa::openapi::OpenApi {
+    documented().into_openapi()
+}
+
+/// The face as a router.
+pub fn router(state: State) -> Router {
+    let (router, api) = documented().split_for_parts();
+    router
+        .route("/openapi.json", routing::get(move || async move { Json(api) }))
+        .fallback(|| async { Problem::new(StatusCode::NOT_FOUND, "NOT_FOUND", "no such path; see /openapi.json") })
+        .method_not_allowed_fallback(|| async {
+            Problem::new(StatusCode::METHOD_NOT_ALLOWED, "METHOD_NOT_ALLOWED", "this path takes other methods; see /openapi.json")
+        })
+        .layer(middleware::from_fn(name_route))
+        .with_state(state)
+}
+
+/// Hands the matched route up to the listener, as a label for its metrics.
+async fn name_route(route: Option<MatchedPath>, request: Request, next: Next) -> Response {
+    let mut response = next.run(request).await;
+    if let Some(route) = route {
+        response.extensions_mut().insert(route);
+    }
+    response
+}
+
+async fn read<T: DeserializeOwned>(body: Body, part: Part, state: &State) -> Result<T, Problem> {
+    let config = state.service.config();
+    Ok(parse(&bytes(body, config).await?, part, config)?)
+}
+
+/// OpenSession
+#[utoipa::path(post, path = "/v1/sessions", request_body = OpenBody, responses((status = 201, body = OpenAnswer), (status = "default", body = Problem)))]
+async fn open_session(Shared(state): Shared<State>, body: Body) -> Result<(StatusCode, Json<OpenAnswer>), Problem> {
+    let request: OpenBody = read(body, Part::Request, &state).await?;
+    let (session, model) = state.service.open(request.into())?;
+    Ok((StatusCode::CREATED, Json(OpenAnswer { session: session.into(), model: (&model).into() })))
+}
+
+/// ListSessions
+#[utoipa::path(get, path = "/v1/sessions", params(ListQuery), responses((status = 200, body = ManySessions), (status = "default", body = Problem)))]
+async fn list_sessions(Shared(state): Shared<State>, query: Result<Query<ListQuery>, QueryRejection>) -> Answer<ManySessions> {
+    let Query(query) = query.map_err(|error| ServiceError::invalid(Part::Request, "query", error.body_text()))?;
+    let ListQuery { page_size, page_token, model } = query;
+    let page = state.service.list(&ListRequest { page_size, page_token, model })?;
+    let sessions = page.sessions.into_iter().map(Into::into).collect();
+    Ok(Json(ManySessions { sessions, next_page_token: page.next_page_token }))
+}
+
+/// GetSession
+#[utoipa::path(get, path = "/v1/sessions/{id}", params(("id" = String, Path)), responses((status = 200, body = OneSession), (status = "default", body = Problem)))]
+async fn get_session(Shared(state): Shared<State>, Path(id): Path<String>) -> Answer<OneSession> {
+    Ok(Json(OneSession { session: state.service.get(&id)?.into() }))
+}
+
+/// CloseSession
+#[utoipa::path(delete, path = "/v1/sessions/{id}", params(("id" = String, Path)), responses((status = 204), (status = "default", body = Problem)))]
+async fn close_session(Shared(state): Shared<State>, Path(id): Path<String>) -> Result<StatusCode, Problem> {
+    state.service.close(&id)?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// ResetSession
+#[utoipa::path(post, path = "/v1/sessions/{id}/reset", params(("id" = String, Path)), request_body = ResetBody,
+    responses((status = 200, body = OneSession), (status = "default", body = Problem)))]
+async fn reset_session(Shared(state): Shared<State>, Path(id): Path<String>, body: Body) -> Answer<OneSession> {
+    let config = state.service.config();
+    let bytes = bytes(body, config).await?;
+    let ResetBody { seed, keep_history } = if bytes.is_empty() { ResetBody::default() } else { parse(&bytes, Part::Request, config)? };
+    let session = state.service.reset(&id, seed, keep_history.unwrap_or(false))?;
+    Ok(Json(OneSession { session: session.into() }))
+}
+
+/// Act
+#[utoipa::path(post, path = "/v1/sessions/{id}/act", params(("id" = String, Path)), request_body = ActBody,
+    responses((status = 200, body = ActAnswer), (status = "default", body = Problem)))]
+async fn act(Shared(state): Shared<State>, Path(id): Path<String>, body: Body) -> Answer<ActAnswer> {
+    let body: ActBody = read(body, Part::Observation, &state).await?;
+    if body.session_id.as_ref().is_some_and(|other| *other != id) {
+        return Err(ServiceError::invalid(Part::Request, "session_id", "differs from the path").into());
+    }
+    Ok(Json((&state.service.act(body.into_request(id)).await?).into()))
+}
+
+/// ActStream, a WebSocket: each text message is an act, each answer a result
+#[utoipa::path(get, path = "/v1/sessions/{id}/stream", params(("id" = String, Path)), responses((status = 101), (status = "default", body = Problem)))]
+async fn act_stream(
+    Shared(state): Shared<State>,
+    Path(id): Path<String>,
+    Extension(gate): Extension<Gate>,
+    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+) -> Result<Response, Problem> {
+    let upgrade = upgrade.map_err(|error| ServiceError::invalid(Part::Request, "headers", error.body_text()))?;
+    state.service.ready()?;
+    state.service.get(&id)?;
+    let limit = state.service.config().limits.message_bytes_max;
+    let upgrade = upgrade.max_message_size(limit).max_frame_size(limit);
+    Ok(upgrade.on_upgrade(move |socket| stream::serve(socket, state, id, gate)))
+}
+
+/// ActBatch
+#[utoipa::path(post, path = "/v1/act:batch", request_body = BatchBody, responses((status = 200, body = BatchAnswer), (status = "default", body = Problem)))]
+async fn act_batch(Shared(state): Shared<State>, body: Body) -> Answer<BatchAnswer> {
+    let body: BatchBody = read(body, Part::Observation, &state).await?;
+    let acts = body.acts.into_iter().map(|mut act| {
+        let session_id = act.session_id.take();
+        let act = act.into_request(session_id.clone().unwrap_or_default());
+        let missing = || ServiceError::invalid(Part::Request, "session_id", "is missing");
+        if session_id.is_some() { Ok(act) } else { Err(ActResult { session_id: String::new(), step: act.step, result: Err(missing()) }) }
+    });
+    let results = state.service.act_batch(acts.collect()).await?;
+    Ok(Json(BatchAnswer { results: results.into_iter().map(Into::into).collect() }))
+}
+
+/// Models.List
+#[utoipa::path(get, path = "/v1/models", responses((status = 200, body = ManyModels), (status = "default", body = Problem)))]
+async fn list_models(Shared(state): Shared<State>) -> Answer<ManyModels> {
+    Ok(Json(ManyModels { models: state.service.models()?.iter().map(Into::into).collect() }))
+}
+
+/// Models.Get
+#[utoipa::path(get, path = "/v1/models/{name}", params(("name" = String, Path, description = "name or name@digest")),
+    responses((status = 200, body = OneModel), (status = "default", body = Problem)))]
+async fn get_model(Shared(state): Shared<State>, Path(name): Path<String>) -> Answer<OneModel> {
+    Ok(Json(OneModel { model: (&state.service.model(&name)?).into() }))
+}
+
+/// Whether the process works: its engine shows signs of life
+#[utoipa::path(get, path = "/livez", responses((status = 200, body = String), (status = 503, body = String)))]
+async fn livez(Shared(state): Shared<State>) -> Response {
+    if state.service.is_alive() { "ok\n".into_response() } else { (StatusCode::SERVICE_UNAVAILABLE, "engine is silent\n").into_response() }
+}
+
+/// Whether it takes work: models loaded, not draining
+#[utoipa::path(get, path = "/readyz", responses((status = 200, body = String), (status = 503, body = String)))]
+async fn readyz(Shared(state): Shared<State>) -> Response {
+    match state.service.ready() {
+        Ok(()) => "ok\n".into_response(),
+        Err(error) => (StatusCode::SERVICE_UNAVAILABLE, format!("{error}\n")).into_response(),
+    }
+}
+
+/// Metrics as Prometheus text
+#[utoipa::path(get, path = "/metrics", responses((status = 200, body = String)))]
+async fn metrics(Shared(state): Shared<State>) -> Response {
+    state.service.refresh_gauges();
+    ([("content-type", "text/plain; version=0.0.4")], state.metrics.render()).into_response()
+}

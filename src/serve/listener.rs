@@ -1,0 +1,216 @@
+//! The one accept loop: both faces on one port, every connection bounded in time, and an end that comes.
+
+use crate::serve::{config::Config, grpc, http::Problem};
+use axum::{
+    Router,
+    body::Body,
+    extract::MatchedPath,
+    http::{HeaderName, HeaderValue, Request, Response, StatusCode},
+    response::IntoResponse,
+};
+use futures_util::FutureExt;
+use hyper::{body::Incoming, service::service_fn};
+use hyper_util::{
+    rt::{TokioExecutor, TokioIo, TokioTimer},
+    server::conn::auto,
+};
+use std::{convert::Infallible, panic::AssertUnwindSafe, pin::pin, sync::Arc, time::Duration, time::Instant};
+use tokio::{
+    io::AsyncWriteExt,
+    net::{TcpListener, TcpStream},
+    sync::{OwnedSemaphorePermit, Semaphore},
+    time::{sleep, timeout},
+};
+use tokio_util::{
+    sync::CancellationToken,
+    task::{TaskTracker, task_tracker::TaskTrackerToken},
+};
+use tower::ServiceExt;
+use tracing::Instrument;
+use uuid::Uuid;
+
+const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+/// For one connection too many: REST clients understand it, gRPC clients see UNAVAILABLE.
+const BUSY: &[u8] = b"HTTP/1.1 503 Service Unavailable\r\nretry-after: 1\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
+/// After a failed accept (too many open files, mostly): the condition does not go away at once.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// What tasks get to notice the hard end.
+const HARD_END_PATIENCE: Duration = Duration::from_millis(200);
+
+/// The two faces as routers.
+#[derive(Clone)]
+pub struct Faces {
+    /// For `content-type: application/grpc`.
+    pub grpc: Router,
+    /// For everything else.
+    pub http: Router,
+}
+
+/// A connection's place among the open ones; whatever outlives the connection (a WebSocket) holds it too.
+#[derive(Clone)]
+pub struct Gate {
+    _place: Arc<(OwnedSemaphorePermit, TaskTrackerToken)>,
+    hard_end: CancellationToken,
+}
+
+impl Gate {
+    /// Runs it to its end, or to the server's hard end.
+    pub async fn until_hard_end(&self, work: impl Future<Output = ()>) {
+        tokio::select! {
+            () = work => {}
+            () = self.hard_end.cancelled() => {}
+        }
+    }
+}
+
+/// Serves both faces until `leave` is cancelled, then lets every request in flight end, for `server.drain_timeout_ms` at most.
+pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
+    let (tracker, hard_end) = (TaskTracker::new(), CancellationToken::new());
+    let places = Arc::new(Semaphore::new(config.server.connections_max));
+    loop {
+        let accepted = tokio::select! {
+            () = leave.cancelled() => break,
+            accepted = listener.accept() => accepted,
+        };
+        match accepted {
+            Ok((stream, _)) => match places.clone().try_acquire_owned() {
+                Ok(permit) => {
+                    let gate = Gate { _place: Arc::new((permit, tracker.token())), hard_end: hard_end.clone() };
+                    tokio::spawn(connection(stream, faces.clone(), config.clone(), leave.clone(), gate));
+                }
+                Err(_) => turn_away(stream),
+            },
+            Err(error) => {
+                tracing::warn!(%error, "accept failed");
+                sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+    drop(listener);
+    tracker.close();
+    if timeout(Duration::from_millis(config.server.drain_timeout_ms), tracker.wait()).await.is_err() {
+        tracing::warn!(connections = tracker.len(), "drain timeout: connections are cut");
+        hard_end.cancel();
+        let _cut = timeout(HARD_END_PATIENCE, tracker.wait()).await;
+    }
+}
+
+fn turn_away(mut stream: TcpStream) {
+    metrics::counter!("ada_connections_refused_total").increment(1);
+    tokio::spawn(async move { timeout(ACCEPT_PAUSE, stream.write_all(BUSY)).await });
+}
+
+async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, leave: CancellationToken, gate: Gate) {
+    metrics::gauge!("ada_connections").increment(1.0);
+    let patience = Duration::from_millis(config.connection.preface_timeout_ms);
+    let greeted = tokio::select! {
+        greeted = timeout(patience, has_spoken(&stream)) => greeted,
+        () = leave.cancelled() => Ok(false),
+    };
+    match greeted {
+        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &leave, &gate)).await,
+        Ok(false) => {}
+        Err(_) => metrics::counter!("ada_connections_timed_out_total").increment(1),
+    }
+    metrics::gauge!("ada_connections").decrement(1.0);
+}
+
+/// Waits until the first bytes decide between HTTP/1 and HTTP/2; false if the peer leaves before. The stock builder would wait for them for ever.
+async fn has_spoken(stream: &TcpStream) -> bool {
+    let mut seen = [0; PREFACE.len()];
+    loop {
+        match stream.peek(&mut seen).await {
+            Ok(0) | Err(_) => return false,
+            Ok(len) if len < PREFACE.len() && PREFACE.starts_with(&seen[..len]) => sleep(Duration::from_millis(5)).await,
+            Ok(_) => return true,
+        }
+    }
+}
+
+async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &CancellationToken, gate: &Gate) {
+    if let Err(error) = stream.set_nodelay(true) {
+        tracing::debug!(%error, "no TCP_NODELAY");
+    }
+    let answer = service_fn(|request| answer(request, faces.clone(), gate.clone()));
+    let builder = builder(config);
+    let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(stream), answer));
+    let ended = tokio::select! {
+        ended = connection.as_mut() => ended,
+        () = leave.cancelled() => {
+            connection.as_mut().graceful_shutdown();
+            connection.await
+        }
+    };
+    if let Err(error) = ended {
+        tracing::debug!(%error, "connection ended");
+    }
+}
+
+fn builder(config: &Config) -> auto::Builder<TokioExecutor> {
+    let config = &config.connection;
+    let mut builder = auto::Builder::new(TokioExecutor::new());
+    builder
+        .http1()
+        .timer(TokioTimer::new())
+        .header_read_timeout(Duration::from_millis(config.header_read_timeout_ms))
+        .max_headers(config.headers_max)
+        .max_buf_size(config.header_bytes_max as usize);
+    builder
+        .http2()
+        .timer(TokioTimer::new())
+        .max_concurrent_streams(config.streams_max)
+        .max_pending_accept_reset_streams(config.pending_resets_max)
+        .max_header_list_size(config.header_bytes_max)
+        .keep_alive_interval(Duration::from_millis(config.keepalive_interval_ms))
+        .keep_alive_timeout(Duration::from_millis(config.keepalive_timeout_ms));
+    builder
+}
+
+/// One request of either face: its id, its log span, its metrics, and a last net for panics.
+async fn answer(request: Request<Incoming>, faces: Faces, gate: Gate) -> Result<Response<Body>, Infallible> {
+    let begin = Instant::now();
+    let is_grpc = grpc::is_grpc(request.headers());
+    let (face, router) = if is_grpc { ("grpc", faces.grpc) } else { ("http", faces.http) };
+    let (id, path) = (request_id(&request), request.uri().path().to_owned());
+    let span = tracing::info_span!("request", %id, face, method = %request.method());
+    let mut request = request.map(Body::new);
+    request.extensions_mut().insert(gate);
+    let work = AssertUnwindSafe(router.oneshot(request).instrument(span.clone())).catch_unwind();
+    let mut response = match work.await {
+        Ok(Ok(response)) => response,
+        Ok(Err(never)) => match never {},
+        Err(_) => span.in_scope(|| {
+            tracing::error!("a handler panicked");
+            Problem::new(StatusCode::INTERNAL_SERVER_ERROR, "INTERNAL", "internal error").into_response()
+        }),
+    };
+    let route = route(&response, is_grpc, path);
+    let status = response.status().as_u16().to_string();
+    span.in_scope(|| tracing::debug!(route, status, us = begin.elapsed().as_micros() as u64, "answered"));
+    metrics::counter!("ada_http_requests_total", "face" => face, "route" => route, "status" => status).increment(1);
+    metrics::histogram!("ada_http_request_duration_seconds", "face" => face).record(begin.elapsed().as_secs_f64());
+    if let Ok(id) = HeaderValue::from_str(&id) {
+        response.headers_mut().insert(REQUEST_ID, id);
+    }
+    Ok(response)
+}
+
+/// The route as a label: never a path that a client made up.
+fn route(response: &Response<Body>, is_grpc: bool, path: String) -> String {
+    const UNIMPLEMENTED: &str = "12";
+    let unknown = || "unknown".to_owned();
+    if is_grpc {
+        let known = response.headers().get("grpc-status").is_none_or(|status| status != UNIMPLEMENTED);
+        return if known { path } else { unknown() };
+    }
+    response.extensions().get::<MatchedPath>().map_or_else(unknown, |route| route.as_str().to_owned())
+}
+
+/// The client's `x-request-id` if it is a plain one, else a new one.
+fn request_id(request: &Request<Incoming>) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
+    let given = request.headers().get(REQUEST_ID).and_then(|id| id.to_str().ok());
+    let given = given.filter(|id| (1..=64).contains(&id.len()) && id.chars().all(plain));
+    given.map_or_else(|| Uuid::new_v4().to_string(), str::to_owned)
+}

@@ -1,0 +1,133 @@
+//! How checkpoints are used: gRPC and REST over one core, on one port.
+//!
+//! The way of a request: [`listener`] (bytes) -> [`grpc`] or [`http`] (convert) -> [`service`] (verbs) -> [`session`] (lease the episode) -> [`engine`]
+//! (queue, batch, network evaluations) -> [`session`] (commit) -> bytes.
+
+pub mod config;
+pub mod engine;
+pub mod error;
+pub mod grpc;
+pub mod http;
+pub mod listener;
+pub mod registry;
+pub mod request;
+mod seat;
+pub mod service;
+pub mod session;
+pub mod telemetry;
+
+use config::Config;
+use listener::Faces;
+use registry::{Registry, RegistryError};
+use service::Service;
+use std::{future::Future, io, net::SocketAddr, sync::Arc, time::Duration};
+use tokio::{
+    net::TcpListener,
+    time::{interval, sleep},
+};
+use tokio_util::sync::CancellationToken;
+
+/// What the engine's threads get to end after the last connection is gone.
+const ENGINE_PATIENCE: Duration = Duration::from_secs(2);
+
+/// Why the server did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// The address is taken or not ours.
+    #[error("server.listen {address}: {source}")]
+    Listen {
+        /// The setting.
+        address: SocketAddr,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// No threads for the engine.
+    #[error("engine: {0}")]
+    Engine(io::Error),
+    /// No model to serve.
+    #[error(transparent)]
+    Models(#[from] RegistryError),
+    /// The build's descriptors are broken.
+    #[error("reflection: {0}")]
+    Reflection(#[from] grpc::ReflectionError),
+}
+
+/// A server that is bound to its address but does not serve yet.
+pub struct Server {
+    listener: TcpListener,
+    config: Config,
+}
+
+impl Server {
+    /// Binds the address; port 0 takes a free one.
+    ///
+    /// # Errors
+    /// If the address cannot be bound.
+    pub async fn bind(config: Config) -> Result<Self, ServerError> {
+        let address = config.server.listen;
+        let listener = TcpListener::bind(address).await.map_err(|source| ServerError::Listen { address, source })?;
+        Ok(Self { listener, config })
+    }
+
+    /// The address it is bound to.
+    ///
+    /// # Errors
+    /// If the system does not say.
+    pub fn address(&self) -> io::Result<SocketAddr> {
+        self.listener.local_addr()
+    }
+
+    /// Serves until `shutdown` is ready, then drains. While the models load, it answers NOT_READY.
+    ///
+    /// # Errors
+    /// If there is no model to serve or the engine does not start.
+    pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<(), ServerError> {
+        let Self { listener, config } = self;
+        let metrics = telemetry::install_metrics();
+        let service = Arc::new(Service::start(config.clone()).map_err(ServerError::Engine)?);
+        let (grpc, health) = grpc::router(service.clone())?;
+        grpc::report(&health, false).await;
+        let faces = Faces { grpc, http: http::router(http::State { service: service.clone(), metrics: metrics.clone() }) };
+        let leave = CancellationToken::new();
+        let listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), leave.clone()));
+        let loaded = load(&service, config.clone()).await;
+        if loaded.is_ok() {
+            grpc::report(&health, true).await;
+            tracing::info!(address = %config.server.listen, "ready");
+            let housekeeping = housekeeping(&service, || metrics.run_upkeep());
+            tokio::select! {
+                () = shutdown => tracing::info!("draining"),
+                () = housekeeping => {}
+            }
+        }
+        grpc::report(&health, false).await;
+        service.drain();
+        sleep(Duration::from_millis(config.server.drain_notice_ms)).await;
+        leave.cancel();
+        if listening.await.is_err() {
+            tracing::error!("the accept loop ended by panic");
+        }
+        let stopping = tokio::task::spawn_blocking(move || service.stop(ENGINE_PATIENCE));
+        if stopping.await.is_err() {
+            tracing::error!("the engine's end panicked");
+        }
+        tracing::info!("ended");
+        loaded
+    }
+}
+
+async fn load(service: &Service, config: Config) -> Result<(), ServerError> {
+    let loaded = tokio::task::spawn_blocking(move || Registry::load(&config.models)).await;
+    let registry = loaded.map_err(|panic| ServerError::Engine(io::Error::other(panic)))??;
+    service.set_registry(registry);
+    Ok(())
+}
+
+async fn housekeeping(service: &Service, upkeep: impl Fn()) {
+    let mut ticks = interval(Duration::from_millis(service.config().sessions.reap_interval_ms));
+    loop {
+        ticks.tick().await;
+        service.reap();
+        upkeep();
+    }
+}

@@ -1,0 +1,144 @@
+//! The loaded models, by name.
+
+use crate::{
+    model::{agent::Agent, checkpoint},
+    serve::{config::ModelsConfig, error::ServiceError},
+};
+use std::{collections::BTreeMap, fs, io, path::Path, path::PathBuf, sync::Arc, time::Instant};
+
+/// Digits of a digest that a client must at least name.
+const DIGEST_PREFIX_MIN: usize = 8;
+const NAME_LEN_MAX: usize = 64;
+
+/// A loaded model under its name.
+#[derive(Clone)]
+pub struct Model {
+    /// Name of the checkpoint's directory.
+    pub name: Arc<str>,
+    /// The model.
+    pub agent: Arc<Agent>,
+    /// Whether it is taken when none is named.
+    pub is_default: bool,
+}
+
+/// The loaded models.
+pub struct Registry {
+    models: BTreeMap<Arc<str>, Model>,
+    default: Arc<str>,
+}
+
+/// Why there is nothing to serve.
+#[derive(Debug, thiserror::Error)]
+pub enum RegistryError {
+    /// The directory cannot be read.
+    #[error("models.dir {dir}: {source}")]
+    Dir {
+        /// The directory.
+        dir: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// No checkpoint in it could be loaded.
+    #[error("models.dir {dir} holds no checkpoint that can be loaded")]
+    Empty {
+        /// The directory.
+        dir: PathBuf,
+    },
+    /// The default model is not among those loaded.
+    #[error("models.default {name:?} is not loaded; there are: {loaded}")]
+    NoDefault {
+        /// What the setting says.
+        name: String,
+        /// What there is.
+        loaded: String,
+    },
+}
+
+impl Registry {
+    /// Loads every checkpoint below the directory. A broken one is logged with its reason and left out.
+    ///
+    /// # Errors
+    /// If the directory cannot be read, or no checkpoint or not the default one could be loaded.
+    pub fn load(config: &ModelsConfig) -> Result<Self, RegistryError> {
+        let dirs = checkpoint_dirs(&config.dir).map_err(|source| RegistryError::Dir { dir: config.dir.clone(), source })?;
+        let loaded = dirs.iter().filter_map(|(name, dir)| load_one(name, dir)).map(|(name, agent)| {
+            let is_default = *name == *config.default;
+            (name.clone(), Model { name, agent, is_default })
+        });
+        let models: BTreeMap<_, _> = loaded.collect();
+        if models.is_empty() {
+            return Err(RegistryError::Empty { dir: config.dir.clone() });
+        }
+        let Some(default) = models.values().find(|model| model.is_default).map(|model| model.name.clone()) else {
+            let loaded = models.keys().map(|name| &**name).collect::<Vec<_>>().join(", ");
+            return Err(RegistryError::NoDefault { name: config.default.clone(), loaded });
+        };
+        Ok(Self { models, default })
+    }
+
+    /// All models by name.
+    pub fn list(&self) -> impl Iterator<Item = &Model> {
+        self.models.values()
+    }
+
+    /// The model `name` or `name@digest`; an empty reference is the default model.
+    ///
+    /// # Errors
+    /// `ModelNotFound` if there is none of this name, or its digest is another.
+    pub fn get(&self, reference: &str) -> Result<&Model, ServiceError> {
+        let (name, digest) = match reference.split_once('@') {
+            Some((name, digest)) => (name, Some(digest)),
+            None => (reference, None),
+        };
+        let name = if name.is_empty() { &*self.default } else { name };
+        let is_meant = |model: &&Model| {
+            digest.is_none_or(|digest| digest.len() >= DIGEST_PREFIX_MIN && model.agent.spec().digest.starts_with(digest))
+        };
+        let shown = || ServiceError::ModelNotFound { model: reference.chars().take(2 * NAME_LEN_MAX).collect() };
+        self.models.get(name).filter(is_meant).ok_or_else(shown)
+    }
+}
+
+/// Sub-directories that hold a `config.json`, with their names, in order.
+fn checkpoint_dirs(dir: &Path) -> io::Result<Vec<(Arc<str>, PathBuf)>> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir)? {
+        let path = entry?.path();
+        if !path.join("config.json").is_file() {
+            continue;
+        }
+        match path.file_name().and_then(|name| name.to_str()).filter(|name| is_name(name)) {
+            Some(name) => found.push((Arc::from(name), path)),
+            None => refuse(&path.to_string_lossy(), "name", &"its name must be 1 to 64 of a-z 0-9 _ . -"),
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+fn is_name(name: &str) -> bool {
+    let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "_.-".contains(c);
+    (1..=NAME_LEN_MAX).contains(&name.len()) && name.chars().all(allowed)
+}
+
+fn load_one(name: &Arc<str>, dir: &Path) -> Option<(Arc<str>, Arc<Agent>)> {
+    let begin = Instant::now();
+    match checkpoint::load(dir) {
+        Ok(agent) => {
+            let digest = agent.spec().digest.clone();
+            metrics::histogram!("ada_model_load_duration_seconds").record(begin.elapsed().as_secs_f64());
+            metrics::gauge!("ada_model_info", "model" => name.to_string(), "digest" => digest.clone()).set(1.0);
+            tracing::info!(model = %name, digest, ms = begin.elapsed().as_millis() as u64, "model loaded");
+            Some((name.clone(), Arc::new(agent)))
+        }
+        Err(error) => {
+            refuse(name, "checkpoint", &error);
+            None
+        }
+    }
+}
+
+fn refuse(name: &str, reason: &'static str, error: &dyn std::fmt::Display) {
+    metrics::counter!("ada_checkpoint_rejected_total", "reason" => reason).increment(1);
+    tracing::error!(model = name, %error, "checkpoint refused");
+}

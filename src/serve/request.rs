@@ -1,0 +1,129 @@
+//! What the faces hand to the service and get back, in the words of the domain.
+
+use crate::{
+    model::agent::{LatentMode, Observation, SamplerOptions},
+    serve::{
+        error::ServiceError,
+        session::{Answer, Summary},
+    },
+};
+use std::{sync::Arc, time::Duration};
+
+/// Which face a request came through; a label of metrics, nothing depends on it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Face {
+    /// gRPC.
+    Grpc,
+    /// REST and WebSocket.
+    Http,
+}
+
+impl Face {
+    /// The word in metrics.
+    pub fn word(self) -> &'static str {
+        match self {
+            Face::Grpc => "grpc",
+            Face::Http => "http",
+        }
+    }
+}
+
+/// Overrides of a model's sampling defaults; None: as the model has it. Fields as in [`SamplerOptions`].
+#[derive(Clone, Debug, Default, PartialEq)]
+#[allow(missing_docs)]
+pub struct OptionsPatch {
+    pub streaming: Option<bool>,
+    pub action_horizon: Option<usize>,
+    pub sub_steps: Option<usize>,
+    pub eta: Option<f32>,
+    pub temperature: Option<f32>,
+    pub kappa: Option<f32>,
+    pub latent: Option<LatentMode>,
+}
+
+impl OptionsPatch {
+    pub(super) fn onto(self, default: &SamplerOptions) -> SamplerOptions {
+        let Self { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = self;
+        SamplerOptions {
+            streaming: streaming.unwrap_or(default.streaming),
+            action_horizon: action_horizon.unwrap_or(default.action_horizon),
+            sub_steps: sub_steps.unwrap_or(default.sub_steps),
+            eta: eta.unwrap_or(default.eta),
+            temperature: temperature.unwrap_or(default.temperature),
+            kappa: kappa.unwrap_or(default.kappa),
+            latent: latent.unwrap_or(default.latent),
+        }
+    }
+}
+
+/// OpenSession.
+#[derive(Clone, Debug, Default)]
+pub struct OpenRequest {
+    /// `name`, `name@digest` or empty for the default.
+    pub model: String,
+    /// Noise seed; None: drawn.
+    pub seed: Option<u64>,
+    /// Overrides.
+    pub options: OptionsPatch,
+    /// Idle time to live; None: the configured one.
+    pub ttl_ms: Option<u64>,
+}
+
+/// Act.
+#[derive(Clone, Debug)]
+pub struct ActRequest {
+    /// Id of the session, as the client wrote it.
+    pub session_id: String,
+    /// Committed step + 1, or the committed step again.
+    pub step: u64,
+    /// What was seen.
+    pub observation: Observation,
+    /// Time it may take; None: the configured one.
+    pub deadline: Option<Duration>,
+    /// Whether the client wants the planned states with the answer.
+    pub want_planned_states: bool,
+    /// Which face it came through.
+    pub face: Face,
+}
+
+/// An answered act.
+#[derive(Clone, Debug)]
+pub struct Acted {
+    /// The committed answer.
+    pub answer: Arc<Answer>,
+    /// Whether an earlier or parallel call computed it.
+    pub replayed: bool,
+    /// Whether the client asked for the planned states.
+    pub want_planned_states: bool,
+}
+
+/// An answer of a batch or stream, with what it belongs to.
+#[derive(Debug)]
+pub struct ActResult {
+    /// As the client wrote it.
+    pub session_id: String,
+    /// As the client wrote it.
+    pub step: u64,
+    /// The answer or the error.
+    pub result: Result<Acted, ServiceError>,
+}
+
+/// ListSessions.
+#[derive(Clone, Debug, Default)]
+pub struct ListRequest {
+    /// 0: the default.
+    pub page_size: usize,
+    /// Id of the last session of the page before; empty: from the beginning.
+    pub page_token: String,
+    /// Only of this model; empty: all.
+    pub model: String,
+}
+
+/// A page of sessions.
+#[derive(Debug)]
+pub struct Page {
+    /// In order of id.
+    pub sessions: Vec<Summary>,
+    /// Empty on the last page.
+    pub next_page_token: String,
+}

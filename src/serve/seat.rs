@@ -1,0 +1,48 @@
+//! The engine's ticket: it brings the outcome of an act home to its session.
+
+use crate::serve::{
+    engine::{Failure, Finished, Ticket},
+    error::ServiceError,
+    session::{Answer, Flight, Session, Timings},
+};
+use std::{sync::Arc, time::Instant};
+use uuid::Uuid;
+
+/// What a client is told to wait when the server is starting or ending.
+pub(super) const RETRY_AFTER_RESTART_MS: u64 = 1_000;
+
+/// See the module.
+pub(super) struct Seat {
+    pub session: Arc<Session>,
+    pub flight: Arc<Flight>,
+}
+
+impl Ticket for Seat {
+    fn is_wanted(&self) -> bool {
+        self.flight.is_wanted()
+    }
+
+    fn start(&self) {
+        self.flight.start();
+    }
+
+    fn settle(self, outcome: Result<Finished, Failure>) {
+        let Self { session, flight } = self;
+        match outcome {
+            Ok(Finished { episode, chunk, queue, compute, at }) => {
+                let now = Instant::now();
+                let timings = Timings { queue, compute, commit: now - at, total: now - flight.arrived };
+                let (model, model_digest) = (session.model.clone(), session.agent.spec().digest.clone());
+                let answer = Answer { session: session.id, step: flight.step, chunk, timings, model, model_digest };
+                session.commit(&flight, episode, answer);
+            }
+            Err(Failure::Agent(error)) => session.fail(&flight, ServiceError::from_agent(error)),
+            Err(Failure::Panic) => {
+                let id = Uuid::new_v4();
+                tracing::error!(%id, model = %session.model, step = flight.step, "the model panicked over an act");
+                session.fail(&flight, ServiceError::EnginePanic { id });
+            }
+            Err(Failure::Stopped) => session.fail(&flight, ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS }),
+        }
+    }
+}

@@ -1,0 +1,338 @@
+//! The one core behind both faces: every verb is a method here, in the words of the domain.
+
+use crate::{
+    model::agent::Episode,
+    serve::{
+        config::Config,
+        engine::{Engine, Job, Question, Refusal},
+        error::{Part, ServiceError, Stage},
+        registry::{Model, Registry},
+        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page},
+        seat::{RETRY_AFTER_RESTART_MS, Seat},
+        session::{Answer, Entry, Opening, Session, Sessions, Summary, Waiter, key_of},
+    },
+};
+use futures_util::{Stream, StreamExt, future::join_all};
+use std::{
+    sync::{Arc, OnceLock},
+    time::{Duration, Instant},
+};
+use tokio::time::timeout_at;
+use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
+
+/// Seeds drawn by the server stay below 2^53, so that every JSON reader keeps them exactly.
+const DRAWN_SEED_BITS: u32 = 53;
+const PAGE_LEN: usize = 100;
+const PAGE_LEN_MAX: usize = 1_000;
+
+/// The service: models, sessions and the engine between them.
+pub struct Service {
+    config: Config,
+    registry: OnceLock<Registry>,
+    sessions: Sessions,
+    engine: Engine<Seat>,
+    draining: CancellationToken,
+}
+
+impl Service {
+    /// A service without models; see [`Service::set_registry`].
+    ///
+    /// # Errors
+    /// If the system gives no threads for the engine.
+    pub fn start(config: Config) -> std::io::Result<Self> {
+        let engine = Engine::start(config.engine.workers, config.engine.queue_len_max, config.engine.batch_len_max)?;
+        let sessions = Sessions::new(config.sessions.clone());
+        Ok(Self { config, registry: OnceLock::new(), sessions, engine, draining: CancellationToken::new() })
+    }
+
+    /// Gives it its models, once; from then on it is ready.
+    pub fn set_registry(&self, registry: Registry) {
+        if self.registry.set(registry).is_err() {
+            tracing::error!("the models were loaded twice; the first ones stay");
+        }
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// Refuses new work from now on; what is in flight goes on.
+    pub fn drain(&self) {
+        self.draining.cancel();
+    }
+
+    /// Cancelled when draining begins.
+    pub fn draining(&self) -> &CancellationToken {
+        &self.draining
+    }
+
+    /// Ends the engine; see [`Engine::stop`].
+    pub fn stop(&self, patience: Duration) {
+        self.engine.stop(patience);
+    }
+
+    /// Whether every worker shows signs of life.
+    pub fn is_alive(&self) -> bool {
+        self.engine.heartbeat_age() <= Duration::from_millis(self.config.engine.heartbeat_age_ms_max)
+    }
+
+    /// Whether it takes new sessions.
+    ///
+    /// # Errors
+    /// Why not.
+    pub fn ready(&self) -> Result<(), ServiceError> {
+        self.registry().map(|_| ())
+    }
+
+    /// House-keeping, to be called every `sessions.reap_interval_ms`.
+    pub fn reap(&self) {
+        self.sessions.reap(Instant::now());
+    }
+
+    /// Brings the gauges up to date before they are read.
+    pub fn refresh_gauges(&self) {
+        let (waiting, running) = self.engine.load();
+        metrics::gauge!("ada_queue_depth").set(waiting as f64);
+        metrics::gauge!("ada_inflight_acts").set(running as f64);
+        metrics::gauge!("ada_sessions").set(self.sessions.len() as f64);
+        metrics::gauge!("ada_session_state_bytes").set(self.sessions.bytes() as f64);
+    }
+
+    /// All models.
+    ///
+    /// # Errors
+    /// `NotReady`, `Draining`.
+    pub fn models(&self) -> Result<Vec<Model>, ServiceError> {
+        Ok(self.registry()?.list().cloned().collect())
+    }
+
+    /// One model by `name`, `name@digest` or empty for the default.
+    ///
+    /// # Errors
+    /// `ModelNotFound`, `NotReady`, `Draining`.
+    pub fn model(&self, reference: &str) -> Result<Model, ServiceError> {
+        self.registry()?.get(reference).cloned()
+    }
+
+    /// OpenSession.
+    ///
+    /// # Errors
+    /// `ModelNotFound`, `Invalid`, `Quota`, `NotReady`, `Draining`.
+    pub fn open(&self, request: OpenRequest) -> Result<(Summary, Model), ServiceError> {
+        let OpenRequest { model, seed, options, ttl_ms } = request;
+        let model = self.model(&model)?;
+        let ttl = self.ttl(ttl_ms)?;
+        let options = options.onto(&model.agent.spec().sampler);
+        let episode = model.agent.open(seed.unwrap_or_else(draw_seed), &options).map_err(ServiceError::from_agent)?;
+        let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, options, ttl };
+        let now = Instant::now();
+        let session = self.sessions.open(opening, now)?;
+        Ok((session.summary(now), model))
+    }
+
+    /// Act.
+    ///
+    /// # Errors
+    /// Every row of the error table; the session is as before.
+    pub async fn act(&self, request: ActRequest) -> Result<Acted, ServiceError> {
+        let (arrived, face) = (Instant::now(), request.face);
+        let session = self.registry().and_then(|_| self.session(&request.session_id));
+        let model = session.as_ref().map_or_else(|_| "unknown".into(), |session| session.model.to_string());
+        let result = match session {
+            Ok(session) => self.act_on(&session, request, arrived).await,
+            Err(error) => Err(error),
+        };
+        count_act(model, face, arrived, &result);
+        result
+    }
+
+    /// ActBatch: each act has its own answer or error, in the order of the acts.
+    ///
+    /// # Errors
+    /// `TooLarge` if there are too many.
+    pub async fn act_batch(&self, acts: Vec<Result<ActRequest, ActResult>>) -> Result<Vec<ActResult>, ServiceError> {
+        let limit = self.config.limits.act_batch_len_max;
+        if acts.len() > limit {
+            metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
+            return Err(ServiceError::TooLarge { what: "number of acts", limit });
+        }
+        Ok(join_all(acts.into_iter().map(|act| self.act_result(act))).await)
+    }
+
+    /// ActStream: answers as they are ready, at most `limits.stream_acts_max` in work; ends when the acts end, or draining begins and the last one is
+    /// answered. An act that could not be read (`Err`) is answered with its error, here as in a batch.
+    pub fn act_stream(self: Arc<Self>, acts: impl Stream<Item = Result<ActRequest, ActResult>>) -> impl Stream<Item = ActResult> {
+        let width = self.config.limits.stream_acts_max;
+        let draining = self.draining.clone().cancelled_owned();
+        let answer = move |act| {
+            let service = self.clone();
+            async move { service.act_result(act).await }
+        };
+        acts.take_until(draining).map(answer).buffer_unordered(width)
+    }
+
+    /// ResetSession.
+    ///
+    /// # Errors
+    /// `SessionNotFound` and its kin, `SessionBusy`, `Draining`.
+    pub fn reset(&self, session_id: &str, seed: Option<u64>, keep_history: bool) -> Result<Summary, ServiceError> {
+        self.registry()?;
+        let session = self.session(session_id)?;
+        let now = Instant::now();
+        session.reset(|episode: &Episode| session.agent.reset(episode, seed.unwrap_or_else(draw_seed), keep_history), now)?;
+        Ok(session.summary(now))
+    }
+
+    /// GetSession.
+    ///
+    /// # Errors
+    /// `SessionNotFound` and its kin.
+    pub fn get(&self, session_id: &str) -> Result<Summary, ServiceError> {
+        Ok(self.session(session_id)?.summary(Instant::now()))
+    }
+
+    /// ListSessions.
+    ///
+    /// # Errors
+    /// `Invalid` if the page token is none of ours.
+    pub fn list(&self, request: &ListRequest) -> Result<Page, ServiceError> {
+        let token = request.page_token.as_str();
+        let not_ours = |_| ServiceError::invalid(Part::Request, "page_token", "is not a token of a page before");
+        let after = if token.is_empty() { None } else { Some(Uuid::try_parse(token).map_err(not_ours)?) };
+        let model = (!request.model.is_empty()).then_some(request.model.as_str());
+        let len = if request.page_size == 0 { PAGE_LEN } else { request.page_size.min(PAGE_LEN_MAX) };
+        let mut found = self.sessions.page(after, model, len + 1);
+        let more = found.len() > len;
+        found.truncate(len);
+        let last = found.last().filter(|_| more);
+        let next_page_token = last.map_or_else(String::new, |session| session.id.to_string());
+        let now = Instant::now();
+        Ok(Page { sessions: found.iter().map(|session| session.summary(now)).collect(), next_page_token })
+    }
+
+    /// CloseSession.
+    ///
+    /// # Errors
+    /// `SessionNotFound` and its kin.
+    pub fn close(&self, session_id: &str) -> Result<(), ServiceError> {
+        self.sessions.close(parse_id(session_id)?, Instant::now())
+    }
+
+    async fn act_result(&self, act: Result<ActRequest, ActResult>) -> ActResult {
+        match act {
+            Ok(act) => {
+                let (session_id, step) = (act.session_id.clone(), act.step);
+                ActResult { session_id, step, result: self.act(act).await }
+            }
+            Err(misread) => misread,
+        }
+    }
+
+    async fn act_on(&self, session: &Arc<Session>, request: ActRequest, arrived: Instant) -> Result<Acted, ServiceError> {
+        let ActRequest { step, observation, deadline, want_planned_states, .. } = request;
+        let limits = &self.config.limits;
+        let longest = Duration::from_millis(limits.act_deadline_ms_max);
+        let patience = deadline.unwrap_or(Duration::from_millis(limits.act_deadline_ms)).min(longest);
+        if patience.is_zero() {
+            return Err(ServiceError::Deadline { stage: Stage::Admission });
+        }
+        let acted = |answer, replayed| Acted { answer, replayed, want_planned_states };
+        let (waiter, replayed) = match session.enter(step, key_of(&observation), arrived)? {
+            Entry::Replay(answer) => {
+                metrics::counter!("ada_replays_total", "source" => "memory").increment(1);
+                return Ok(acted(answer, true));
+            }
+            Entry::Join(waiter) => {
+                metrics::counter!("ada_replays_total", "source" => "inflight").increment(1);
+                (waiter, true)
+            }
+            Entry::Lead(waiter, episode) => {
+                self.submit(Seat { session: session.clone(), flight: waiter.flight().clone() }, Question { episode, observation });
+                (waiter, false)
+            }
+        };
+        wait(&waiter, arrived + patience).await.map(|answer| acted(answer, replayed))
+    }
+
+    /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
+    fn submit(&self, seat: Seat, question: Question) {
+        let agent = seat.session.agent.clone();
+        let descent = match question.begin(&agent) {
+            Ok(descent) => descent,
+            Err(error) => return seat.session.fail(&seat.flight, ServiceError::from_agent(error)),
+        };
+        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now() };
+        let Err((refusal, job)) = self.engine.submit(job) else { return };
+        let error = match refusal {
+            Refusal::Full => {
+                metrics::counter!("ada_shed_total", "reason" => "QUEUE_FULL").increment(1);
+                ServiceError::QueueFull { retry_after_ms: self.config.engine.retry_after_ms }
+            }
+            Refusal::Closed => ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS },
+        };
+        job.ticket.session.fail(&job.ticket.flight, error);
+    }
+
+    fn registry(&self) -> Result<&Registry, ServiceError> {
+        let retry_after_ms = RETRY_AFTER_RESTART_MS;
+        if self.draining.is_cancelled() {
+            return Err(ServiceError::Draining { retry_after_ms });
+        }
+        self.registry.get().ok_or(ServiceError::NotReady { retry_after_ms })
+    }
+
+    fn session(&self, session_id: &str) -> Result<Arc<Session>, ServiceError> {
+        self.sessions.get(parse_id(session_id)?, Instant::now())
+    }
+
+    fn ttl(&self, ttl_ms: Option<u64>) -> Result<Duration, ServiceError> {
+        let config = &self.config.sessions;
+        let ttl_ms = ttl_ms.unwrap_or(config.ttl_ms);
+        if !(1..=config.ttl_ms_max).contains(&ttl_ms) {
+            return Err(ServiceError::invalid(Part::Request, "ttl_ms", format!("must be 1 to {}", config.ttl_ms_max)));
+        }
+        Ok(Duration::from_millis(ttl_ms))
+    }
+}
+
+async fn wait(waiter: &Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {
+    match timeout_at(deadline.into(), waiter.outcome()).await {
+        Ok(outcome) => outcome,
+        Err(_) => Err(ServiceError::Deadline { stage: waiter.flight().stage() }),
+    }
+}
+
+fn parse_id(session_id: &str) -> Result<Uuid, ServiceError> {
+    Uuid::try_parse(session_id).map_err(|_| ServiceError::SessionNotFound)
+}
+
+fn draw_seed() -> u64 {
+    let random_low_bits = Uuid::new_v4().as_u128() as u64;
+    random_low_bits & ((1 << DRAWN_SEED_BITS) - 1)
+}
+
+fn count_act(model: String, face: Face, arrived: Instant, result: &Result<Acted, ServiceError>) {
+    let code = result.as_ref().map_or_else(ServiceError::reason, |_| "OK");
+    metrics::counter!("ada_acts_total", "model" => model.clone(), "face" => face.word(), "code" => code).increment(1);
+    match result {
+        Ok(acted) => {
+            metrics::histogram!("ada_act_duration_seconds", "model" => model.clone()).record(arrived.elapsed().as_secs_f64());
+            if !acted.replayed {
+                let Answer { chunk, timings, .. } = &*acted.answer;
+                metrics::histogram!("ada_act_queue_seconds").record(timings.queue.as_secs_f64());
+                metrics::histogram!("ada_act_compute_seconds").record(timings.compute.as_secs_f64());
+                metrics::histogram!("ada_act_commit_seconds").record(timings.commit.as_secs_f64());
+                metrics::histogram!("ada_act_network_evaluations").record(f64::from(chunk.evaluations));
+                metrics::counter!("ada_network_evaluations_total", "model" => model).increment(chunk.evaluations.into());
+            }
+        }
+        Err(error) => {
+            if error.committed_step().is_some() {
+                metrics::counter!("ada_step_conflicts_total", "reason" => error.reason()).increment(1);
+            }
+            tracing::debug!(reason = error.reason(), %error, "act refused");
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! An act in flight and those who wait for it: it is computed as long as somebody waits, however many join or leave.
+
+use crate::serve::{
+    error::{ServiceError, Stage},
+    session::{Key, Outcome, Session},
+};
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
+    },
+    time::Instant,
+};
+use tokio::sync::watch;
+
+/// An act in flight.
+pub struct Flight {
+    /// The step it would commit.
+    pub step: u64,
+    /// Key of its observation.
+    pub key: Key,
+    /// When its first caller came.
+    pub arrived: Instant,
+    /// Nobody can join once this is 0: the flight is over.
+    waiters: AtomicUsize,
+    computing: AtomicBool,
+    outcome: watch::Sender<Option<Outcome>>,
+}
+
+impl Flight {
+    pub(super) fn new(step: u64, key: Key, arrived: Instant) -> Arc<Self> {
+        let (waiters, computing, outcome) = (AtomicUsize::new(1), AtomicBool::new(false), watch::Sender::new(None));
+        Arc::new(Self { step, key, arrived, waiters, computing, outcome })
+    }
+
+    /// Whether somebody waits and there is no outcome yet.
+    pub fn is_wanted(&self) -> bool {
+        self.waiters.load(Ordering::Acquire) > 0 && self.outcome.borrow().is_none()
+    }
+
+    /// Marks that it left the queue.
+    pub fn start(&self) {
+        self.computing.store(true, Ordering::Relaxed);
+    }
+
+    /// Queue or compute.
+    pub fn stage(&self) -> Stage {
+        if self.computing.load(Ordering::Relaxed) { Stage::Compute } else { Stage::Queue }
+    }
+
+    /// Tells everyone who waits; the first outcome stands.
+    pub(super) fn settle(&self, outcome: Outcome) {
+        self.outcome.send_if_modified(|current| {
+            let first = current.is_none();
+            if first {
+                *current = Some(outcome);
+            }
+            first
+        });
+    }
+}
+
+/// Somebody who waits for a flight; dropping it is leaving.
+pub struct Waiter {
+    session: Arc<Session>,
+    flight: Arc<Flight>,
+}
+
+impl Waiter {
+    pub(super) fn lead(session: &Arc<Session>, flight: Arc<Flight>) -> Self {
+        Self { session: session.clone(), flight }
+    }
+
+    /// None if the last one has left already.
+    pub(super) fn join(session: &Arc<Session>, flight: &Arc<Flight>) -> Option<Self> {
+        let one_more = |waiters| (waiters > 0).then_some(waiters + 1);
+        flight.waiters.fetch_update(Ordering::AcqRel, Ordering::Acquire, one_more).ok()?;
+        Some(Self { session: session.clone(), flight: flight.clone() })
+    }
+
+    /// What it waits for.
+    pub fn flight(&self) -> &Arc<Flight> {
+        &self.flight
+    }
+
+    /// Waits for the outcome.
+    pub async fn outcome(&self) -> Outcome {
+        let mut outcome = self.flight.outcome.subscribe();
+        let settled = outcome.wait_for(Option::is_some).await.ok().and_then(|outcome| outcome.clone());
+        settled.unwrap_or(Err(ServiceError::SessionNotFound))
+    }
+}
+
+impl Drop for Waiter {
+    fn drop(&mut self) {
+        if self.flight.waiters.fetch_sub(1, Ordering::AcqRel) == 1 && self.flight.outcome.borrow().is_none() {
+            metrics::counter!("ada_cancelled_total", "stage" => self.flight.stage().word()).increment(1);
+            self.session.slot.lock().release(&self.flight);
+        }
+    }
+}

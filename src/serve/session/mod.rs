@@ -1,0 +1,364 @@
+//! One session: an episode as a value, the last committed answer, and at most one act in flight. The step protocol (R1, R2) stands here.
+
+mod flight;
+mod table;
+
+pub use flight::{Flight, Waiter};
+pub use table::Sessions;
+
+use crate::{
+    model::agent::{Agent, Chunk, Episode, Executed, Observation, SamplerOptions},
+    serve::error::ServiceError,
+};
+use parking_lot::Mutex;
+use sha2::{Digest, Sha256};
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::{Duration, Instant},
+};
+use uuid::Uuid;
+
+/// SHA-256 of an observation: what "the same observation" means for a repeated step.
+pub type Key = [u8; 32];
+
+/// What becomes of an act: the answer, shared by all who wait for it, or why there is none.
+pub type Outcome = Result<Arc<Answer>, ServiceError>;
+
+/// A committed answer.
+#[derive(Debug, PartialEq)]
+pub struct Answer {
+    /// Whose it is.
+    pub session: Uuid,
+    /// The step it committed.
+    pub step: u64,
+    /// What the model said.
+    pub chunk: Chunk,
+    /// Where the time went.
+    pub timings: Timings,
+    /// Name of the model.
+    pub model: Arc<str>,
+    /// Its digest.
+    pub model_digest: String,
+}
+
+/// Where the time of an act went.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Timings {
+    /// Waiting for a worker.
+    pub queue: Duration,
+    /// Network evaluations, those of batch mates included.
+    pub compute: Duration,
+    /// Storing episode and answer.
+    pub commit: Duration,
+    /// From arrival to the answer.
+    pub total: Duration,
+}
+
+/// What a session is opened with.
+pub struct Opening {
+    /// Name of the model.
+    pub model: Arc<str>,
+    /// The model.
+    pub agent: Arc<Agent>,
+    /// The first episode.
+    pub episode: Episode,
+    /// Options it was opened with, for later episodes.
+    pub options: SamplerOptions,
+    /// Idle time to live.
+    pub ttl: Duration,
+}
+
+/// One session. Its slot is locked for moments only, never while a model runs or across an await.
+pub struct Session {
+    /// Random, 122 bits: knowing it is the right to use it.
+    pub id: Uuid,
+    /// Name of the model.
+    pub model: Arc<str>,
+    /// The model itself: a session keeps the weights it was opened on.
+    pub agent: Arc<Agent>,
+    /// Sampling options of all its episodes.
+    pub options: SamplerOptions,
+    ttl: Duration,
+    opened: Instant,
+    /// Memory of all sessions of the table, kept up to date by each.
+    bytes_total: Arc<AtomicUsize>,
+    slot: Mutex<Slot>,
+}
+
+struct Slot {
+    touched: Instant,
+    /// How often the session was reset.
+    resets: u64,
+    committed: Committed,
+    flight: Option<Arc<Flight>>,
+    ended: bool,
+}
+
+/// What the last commit left: the episode and, but for a fresh one, the answer with the key of its question.
+struct Committed {
+    step: u64,
+    episode: Arc<Episode>,
+    last: Option<(Key, Arc<Answer>)>,
+}
+
+impl Committed {
+    fn fresh(episode: Episode) -> Self {
+        Self { step: 0, episode: Arc::new(episode), last: None }
+    }
+}
+
+/// How a step stands to the session.
+pub enum Entry {
+    /// It is the committed one: this is its answer.
+    Replay(Arc<Answer>),
+    /// It is in flight: wait for it.
+    Join(Waiter),
+    /// It is the next one: compute it from this episode.
+    Lead(Waiter, Arc<Episode>),
+}
+
+/// A session in numbers.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Summary {
+    /// Its id.
+    pub id: Uuid,
+    /// Name of the model.
+    pub model: Arc<str>,
+    /// Digest of the model.
+    pub model_digest: String,
+    /// Seed of the running episode.
+    pub seed: u64,
+    /// Acts committed in the running episode.
+    pub committed_step: u64,
+    /// How often it was reset.
+    pub episode: u64,
+    /// Options in force.
+    pub options: SamplerOptions,
+    /// Latent mean and log-variance after the last act.
+    pub latent: Option<(Vec<f32>, Vec<f32>)>,
+    /// Since it was opened.
+    pub age: Duration,
+    /// Since it was touched.
+    pub idle: Duration,
+    /// When idle for so long it expires.
+    pub ttl: Duration,
+    /// Memory of its episode.
+    pub state_bytes: usize,
+    /// Whether an act is in flight.
+    pub busy: bool,
+}
+
+impl Session {
+    fn new(opening: Opening, bytes_total: Arc<AtomicUsize>, now: Instant) -> Self {
+        let Opening { model, agent, episode, options, ttl } = opening;
+        bytes_total.fetch_add(episode.size_bytes(), Ordering::Relaxed);
+        let slot = Slot { touched: now, resets: 0, committed: Committed::fresh(episode), flight: None, ended: false };
+        Self { id: Uuid::new_v4(), model, agent, options, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
+    }
+
+    /// Takes up a step: replays, joins or leads it.
+    ///
+    /// # Errors
+    /// If the step is out of order, busy, or known with another observation, or if the session has ended.
+    pub fn enter(self: &Arc<Self>, step: u64, key: Key, now: Instant) -> Result<Entry, ServiceError> {
+        let mut slot = self.slot.lock();
+        if slot.ended {
+            return Err(ServiceError::SessionNotFound);
+        }
+        slot.touched = now;
+        let committed = slot.committed.step;
+        if step == committed
+            && let Some((last_key, answer)) = &slot.committed.last
+        {
+            let same = *last_key == key;
+            return if same { Ok(Entry::Replay(answer.clone())) } else { Err(ServiceError::StepPayloadMismatch { step, committed }) };
+        }
+        if step != committed + 1 {
+            let busy = slot.flight.as_ref().is_some_and(|flight| flight.is_wanted());
+            return Err(if busy { ServiceError::SessionBusy { committed } } else { ServiceError::StepOutOfOrder { step, committed } });
+        }
+        if let Some(flight) = &slot.flight
+            && let Some(waiter) = Waiter::join(self, flight)
+        {
+            return if flight.key == key { Ok(Entry::Join(waiter)) } else { Err(ServiceError::StepPayloadMismatch { step, committed }) };
+        }
+        let waiter = Waiter::lead(self, Flight::new(step, key, now));
+        slot.flight = Some(waiter.flight().clone());
+        Ok(Entry::Lead(waiter, slot.committed.episode.clone()))
+    }
+
+    /// Commits the episode and the answer together, if the flight is still the session's; a flight that was dropped meanwhile changes nothing.
+    pub fn commit(&self, flight: &Arc<Flight>, episode: Episode, answer: Answer) {
+        let answer = Arc::new(answer);
+        let outcome = {
+            let mut slot = self.slot.lock();
+            if slot.release(flight) && slot.committed.step + 1 == flight.step {
+                self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
+                slot.committed = Committed { step: flight.step, episode: Arc::new(episode), last: Some((flight.key, answer.clone())) };
+                slot.touched = Instant::now();
+                Ok(answer)
+            } else {
+                Err(ServiceError::SessionNotFound)
+            }
+        };
+        flight.settle(outcome);
+    }
+
+    /// Ends a flight without a commit; the session stands where it stood.
+    pub fn fail(&self, flight: &Arc<Flight>, error: ServiceError) {
+        self.slot.lock().release(flight);
+        flight.settle(Err(error));
+    }
+
+    /// A new episode, made from the old one.
+    ///
+    /// # Errors
+    /// While an act is in flight, or after the end.
+    pub fn reset(&self, renew: impl FnOnce(&Episode) -> Episode, now: Instant) -> Result<(), ServiceError> {
+        let mut slot = self.slot.lock();
+        if slot.ended {
+            return Err(ServiceError::SessionNotFound);
+        }
+        if slot.flight.as_ref().is_some_and(|flight| flight.is_wanted()) {
+            return Err(ServiceError::SessionBusy { committed: slot.committed.step });
+        }
+        let episode = renew(&slot.committed.episode);
+        self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
+        slot.flight = None;
+        slot.resets += 1;
+        slot.touched = now;
+        slot.committed = Committed::fresh(episode);
+        Ok(())
+    }
+
+    /// The session in numbers.
+    pub fn summary(&self, now: Instant) -> Summary {
+        let slot = self.slot.lock();
+        let episode = &slot.committed.episode;
+        Summary {
+            id: self.id,
+            model: self.model.clone(),
+            model_digest: self.agent.spec().digest.clone(),
+            seed: episode.seed(),
+            committed_step: slot.committed.step,
+            episode: slot.resets,
+            options: self.options.clone(),
+            latent: episode.latent().map(|(mean, log_var)| (mean.to_vec(), log_var.to_vec())),
+            age: now.saturating_duration_since(self.opened),
+            idle: now.saturating_duration_since(slot.touched),
+            ttl: self.ttl,
+            state_bytes: episode.size_bytes(),
+            busy: slot.flight.as_ref().is_some_and(|flight| flight.is_wanted()),
+        }
+    }
+
+    fn touch(&self, now: Instant) {
+        self.slot.lock().touched = now;
+    }
+
+    /// When it was last touched, if no act is in flight.
+    fn idle_since(&self) -> Option<Instant> {
+        let slot = self.slot.lock();
+        slot.flight.is_none().then_some(slot.touched)
+    }
+
+    /// Ends it if it has been idle for `idle_min`; says whether it did.
+    fn end_if_idle(&self, idle_min: Duration, now: Instant) -> bool {
+        let mut slot = self.slot.lock();
+        let idle = slot.flight.is_none() && now.saturating_duration_since(slot.touched) >= idle_min;
+        if idle && !slot.ended {
+            self.end_slot(&mut slot);
+        }
+        idle
+    }
+
+    /// Ends it in any case; whoever waits for an act learns that the session is gone.
+    fn end(&self) {
+        let flight = {
+            let mut slot = self.slot.lock();
+            if !slot.ended {
+                self.end_slot(&mut slot);
+            }
+            slot.flight.take()
+        };
+        if let Some(flight) = flight {
+            flight.settle(Err(ServiceError::SessionNotFound));
+        }
+    }
+
+    fn end_slot(&self, slot: &mut Slot) {
+        slot.ended = true;
+        self.bytes_total.fetch_sub(slot.committed.episode.size_bytes(), Ordering::Relaxed);
+    }
+
+    fn swap_bytes(&self, old: usize, new: usize) {
+        self.bytes_total.fetch_add(new, Ordering::Relaxed);
+        self.bytes_total.fetch_sub(old, Ordering::Relaxed);
+    }
+}
+
+impl Slot {
+    /// Frees the place of this flight; says whether it still held it.
+    fn release(&mut self, flight: &Arc<Flight>) -> bool {
+        let held = self.flight.as_ref().is_some_and(|current| Arc::ptr_eq(current, flight));
+        if held {
+            self.flight = None;
+        }
+        held && !self.ended
+    }
+}
+
+/// Key of an observation: every value by its bits, every absence by a mark, every list by its length.
+pub fn key_of(observation: &Observation) -> Key {
+    let Observation { state, executed } = observation;
+    let mut hash = Sha256::new();
+    let mut put = |values: Option<&[f32]>| {
+        hash.update(values.map_or(u64::MAX, |values| values.len() as u64).to_le_bytes());
+        for value in values.into_iter().flatten() {
+            hash.update(value.to_bits().to_le_bytes());
+        }
+    };
+    put(Some(state));
+    for Executed { state, action, reward } in executed {
+        put(state.as_deref());
+        put(action.as_deref());
+        put(reward.as_ref().map(std::slice::from_ref));
+    }
+    hash.finalize().into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Whatever differs in meaning differs in key, also where the flat list of numbers is the same.
+    #[test]
+    fn keys_tell_observations_apart() {
+        let step = |state: Option<&[f32]>, action: Option<&[f32]>, reward| Executed {
+            state: state.map(<[f32]>::to_vec),
+            action: action.map(<[f32]>::to_vec),
+            reward,
+        };
+        let observations = [
+            Observation { state: vec![1.0, 2.0], executed: vec![] },
+            Observation { state: vec![1.0], executed: vec![] },
+            Observation { state: vec![1.0], executed: vec![step(Some(&[2.0]), None, None)] },
+            Observation { state: vec![1.0], executed: vec![step(None, Some(&[2.0]), None)] },
+            Observation { state: vec![1.0], executed: vec![step(None, None, Some(2.0))] },
+            Observation { state: vec![1.0], executed: vec![step(None, None, None)] },
+            Observation { state: vec![1.0], executed: vec![step(Some(&[]), None, None)] },
+            Observation { state: vec![1.0], executed: vec![step(None, None, None), step(None, None, None)] },
+            Observation { state: vec![0.0], executed: vec![] },
+            Observation { state: vec![-0.0], executed: vec![] },
+        ];
+        for (i, a) in observations.iter().enumerate() {
+            assert_eq!(key_of(a), key_of(&a.clone()));
+            for b in &observations[..i] {
+                assert_ne!(key_of(a), key_of(b), "{a:?} {b:?}");
+            }
+        }
+    }
+}

@@ -1,0 +1,106 @@
+//! Logs and metrics. Every metric is described in [`CATALOGUE`], in base units; no label ever holds a session id.
+
+use crate::serve::config::{LogFormat, TelemetryConfig};
+use metrics::Unit;
+use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
+use std::sync::{Mutex, PoisonError};
+use tracing_subscriber::EnvFilter;
+
+/// Seconds; fine enough for acts of a millisecond.
+const LATENCY_BUCKETS: [f64; 24] = [
+    0.0001, 0.0003, 0.0006, 0.001, 0.002, 0.003, 0.005, 0.008, 0.013, 0.02, 0.03, 0.05, 0.08, 0.13, 0.2, 0.3, 0.5, 0.8, 1.0, 2.0, 5.0, 10.0, 20.0,
+    50.0,
+];
+/// Powers of two, for counts.
+const COUNT_BUCKETS: [f64; 10] = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0];
+
+/// Kind of a metric.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// Only grows.
+    Counter,
+    /// Goes up and down.
+    Gauge,
+    /// A distribution.
+    Histogram,
+}
+
+use Kind::{Counter, Gauge, Histogram};
+
+/// Every metric: name, kind, meaning.
+pub const CATALOGUE: [(&str, Kind, &str); 31] = [
+    ("ada_build_info", Gauge, "1, labelled by version"),
+    ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
+    ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
+    ("ada_model_load_duration_seconds", Histogram, "time to read, check and build a model"),
+    ("ada_connections", Gauge, "open connections"),
+    ("ada_connections_refused_total", Counter, "connections beyond server.connections_max"),
+    ("ada_connections_timed_out_total", Counter, "connections closed because they did not speak in time"),
+    ("ada_http_requests_total", Counter, "requests of either face, by face, route and status"),
+    ("ada_http_request_duration_seconds", Histogram, "until the response head of a request, by face"),
+    ("ada_acts_total", Counter, "acts, by model, face and outcome (OK or the error's reason)"),
+    ("ada_act_duration_seconds", Histogram, "an act from arrival to answer, by model"),
+    ("ada_act_queue_seconds", Histogram, "waiting for a worker"),
+    ("ada_act_compute_seconds", Histogram, "network evaluations of an act, batch mates included"),
+    ("ada_act_commit_seconds", Histogram, "storing the new episode with its answer"),
+    ("ada_act_network_evaluations", Histogram, "denoiser evaluations of an act"),
+    ("ada_network_evaluations_total", Counter, "denoiser evaluations, by model (one per act and tick)"),
+    ("ada_wasted_network_evaluations_total", Counter, "evaluations of acts that were dropped"),
+    ("ada_batch_size", Histogram, "acts that share one network evaluation"),
+    ("ada_batches_total", Counter, "network evaluations of whole batches"),
+    ("ada_queue_depth", Gauge, "acts that wait for a worker"),
+    ("ada_inflight_acts", Gauge, "acts in the batches of the workers"),
+    ("ada_shed_total", Counter, "requests refused because a bound was reached, by reason"),
+    ("ada_cancelled_total", Counter, "acts that nobody waited for any more, by stage"),
+    ("ada_replays_total", Counter, "acts answered without computing, by source: memory or inflight"),
+    ("ada_step_conflicts_total", Counter, "acts refused for their step, by reason"),
+    ("ada_sessions", Gauge, "live sessions"),
+    ("ada_session_state_bytes", Gauge, "memory of all episodes"),
+    ("ada_sessions_created_total", Counter, "sessions opened"),
+    ("ada_sessions_ended_total", Counter, "sessions ended, by reason: closed, expired, evicted"),
+    ("ada_engine_panics_total", Counter, "panics caught in the engine"),
+    ("ada_nonfinite_total", Counter, "non-finite network outputs, by place"),
+];
+
+/// Starts logging as configured. A second call in one process is ignored: the first one's choice stands.
+pub fn install_log(config: &TelemetryConfig) {
+    let filter = EnvFilter::try_new(&config.log).unwrap_or_else(|_| EnvFilter::new("info"));
+    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    let _second_call = match config.format {
+        LogFormat::Pretty => builder.try_init(),
+        LogFormat::Json => builder.json().flatten_event(true).try_init(),
+    };
+}
+
+/// Starts collecting metrics, once a process, and gives the handle that renders them.
+pub fn install_metrics() -> PrometheusHandle {
+    static HANDLE: Mutex<Option<PrometheusHandle>> = Mutex::new(None);
+    let mut handle = HANDLE.lock().unwrap_or_else(PoisonError::into_inner);
+    handle
+        .get_or_insert_with(|| {
+            let recorder = PrometheusBuilder::new()
+                .set_buckets(&LATENCY_BUCKETS)
+                .and_then(|builder| builder.set_buckets_for_metric(Matcher::Full("ada_batch_size".to_owned()), &COUNT_BUCKETS))
+                .and_then(|builder| builder.set_buckets_for_metric(Matcher::Full("ada_act_network_evaluations".to_owned()), &COUNT_BUCKETS))
+                .expect("bucket lists are not empty, or it is a bug")
+                .build_recorder();
+            let handle = recorder.handle();
+            if metrics::set_global_recorder(recorder).is_err() {
+                tracing::warn!("another metrics recorder is installed; /metrics stays empty");
+            }
+            describe();
+            handle
+        })
+        .clone()
+}
+
+fn describe() {
+    for (name, kind, meaning) in CATALOGUE {
+        match kind {
+            Counter => metrics::describe_counter!(name, Unit::Count, meaning),
+            Gauge => metrics::describe_gauge!(name, Unit::Count, meaning),
+            Histogram => metrics::describe_histogram!(name, Unit::Count, meaning),
+        }
+    }
+    metrics::gauge!("ada_build_info", "version" => env!("CARGO_PKG_VERSION")).set(1.0);
+}
