@@ -1,4 +1,45 @@
 //! Ada-Diffuser: infer a hidden context from a few time steps, and let a causal diffusion model plan with it.
+//!
+//! # The map
+//! | room | what | start at |
+//! |---|---|---|
+//! | [`model`] | what Ada-Diffuser is: tensors in, tensors out | [`model::agent::Agent`] |
+//! | [`train`] | how checkpoints are made from recorded rollouts | [`train::recipe`] |
+//! | [`serve`] | how checkpoints are used: gRPC and REST | [`serve::service`] |
+//!
+//! ```text
+//! bin/server -> serve -> model <- train <- bin/trainer        serve and train never meet
+//! model: noise, trajectory <- normalizer <- nn <- {latent | denoiser} <- diffusion <- agent <- checkpoint
+//! ```
+//! Only `model` and `train` know candle; only `serve` knows tokio, tonic, axum and the clock; tests in `tests/it` read the source and hold
+//! these borders.
+//!
+//! # One request, followed by hand
+//! 1. Bytes arrive at [`serve::listener`]; [`serve::grpc`] or [`serve::http`] turns them into a request of the core and checks them.
+//! 2. [`serve::session`] compares the step with the committed one: a retry is answered from memory, a wrong step refused; otherwise the
+//!    episode, an immutable value ([`model::agent::Episode`]), is leased.
+//! 3. [`model::agent::Agent::begin`] checks the observation and makes a [`model::agent::Descent`]: a window on its way down the ladder
+//!    ([`model::diffusion::ladder`]).
+//! 4. [`serve::engine`] calls [`model::agent::Agent::advance`] on all descents in flight: one forward a tick. Inside, the latent is inferred
+//!    from what was really seen ([`model::latent`]), refined at rung 1 by the window itself (zig-zag), and the denoiser
+//!    ([`model::denoiser`]) takes every window one row down.
+//! 5. A finished descent is a new episode and a [`model::agent::Chunk`]; the session commits both together, if the step is still the
+//!    same, and the answer goes out.
+//!
+//! Training is the mirror: recipe -> data set -> stage 1 ([`model::latent::elbo`]) -> stage 2 ([`model::diffusion::refine`]) ->
+//! [`model::checkpoint`]. Losses live beside the networks they train; [`train`] turns the crank.
+//!
+//! # Paper and code
+//! Two clocks, two letters: `t` is environment time, `k` is noise level.
+//!
+//! | paper | code | paper | code |
+//! |---|---|---|---|
+//! | K | `level_max` | T_o | `obs_horizon` |
+//! | k_i | `level`, `levels` | T_p | `plan_horizon` |
+//! | abar_k | `alpha_bar` | T_a | `action_horizon` |
+//! | eps_theta | [`model::denoiser::Denoiser::predict`] (it predicts x0) | T_x | `block_len` |
+//! | c_t | `latent`, `latents` | x_t | [`model::trajectory::Token`], columns by [`model::trajectory::Layout`] |
+//! | p_phi, q_psi, p(x given x, c) | [`model::latent::Prior`], [`model::latent::Encoder`], [`model::latent::Decoder`] | zig-zag | `kappa` |
 #![warn(missing_docs)]
 pub mod model;
 pub mod serve;
