@@ -1,7 +1,12 @@
 //! `ada-trainer`: flags -> recipe -> `train::run`.
-use ada_diffuser::train::{self, Options, Outcome, recipe::Recipe, report};
+use ada_diffuser::train::{
+    self, Options, Outcome,
+    flags::{Cli, Inspect, Probe, Run},
+    recipe::Recipe,
+    report,
+};
 use anyhow::{Context, Result, anyhow};
-use clap::{Args, Parser};
+use clap::Parser;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::{Command, ExitCode};
@@ -13,68 +18,14 @@ const STACK_BYTES: usize = 256 << 20;
 /// One process, one core: at these sizes threads cost more than they give, and results must not depend on their number.
 const THREADS: [&str; 2] = ["RAYON_NUM_THREADS", "CANDLE_NUM_THREADS"];
 
-/// Train Ada-Diffuser: data set and recipe in, checkpoint out.
-///
-///   ada-trainer run models/point-wind-s/recipe.toml --out runs/point-wind-s
-///   ada-trainer probe runs/point-wind-s data/point-wind-s.h5
-///   ada-trainer inspect runs/point-wind-s
-///
-/// Data sets are HDF5 files in D4RL's layout, for example from `ada-collect`. A run that was stopped (Ctrl-C, kill -9) goes on by
-/// the same command, with the same bits as if it had never stopped.
-#[derive(Parser)]
-#[command(version, verbatim_doc_comment)]
-enum Cli {
-    /// Train a recipe, or go on with it: stage 1 (what cannot be seen), its gate, stage 2 (denoise and refine), checkpoint
-    Run(Run),
-    /// How well a checkpoint's latent knows the hidden context that a data set tells (infos/context)
-    Probe(Probe),
-    /// Check a checkpoint and say what it is: architecture, origin, recipe, measurements
-    Inspect(Inspect),
+fn main() -> ExitCode {
+    start(Cli::parse()).unwrap_or_else(|error| {
+        eprintln!("error: {error:#}");
+        ExitCode::FAILURE
+    })
 }
 
-#[derive(Args)]
-struct Run {
-    /// The recipe; models/*/recipe.toml are examples with every key explained
-    recipe: PathBuf,
-    /// Training seed instead of the recipe's
-    #[arg(long)]
-    seed: Option<u64>,
-    /// Where checkpoint, training state and logs (training/) go [default: runs/NAME-seedN]
-    #[arg(long)]
-    out: Option<PathBuf>,
-    /// HDF5 file instead of the recipe's
-    #[arg(long)]
-    data: Option<PathBuf>,
-    /// Another value for a key of the recipe, e.g. --set stage2.steps=100; may be given often
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    overrides: Vec<String>,
-    /// Stop after this many steps as if interrupted; the same command goes on
-    #[arg(long, value_name = "N")]
-    stop_after_steps: Option<usize>,
-}
-
-#[derive(Args)]
-struct Probe {
-    /// Directory of the checkpoint
-    checkpoint: PathBuf,
-    /// HDF5 file with infos/context
-    data: PathBuf,
-    /// Print JSON instead of a table
-    #[arg(long)]
-    json: bool,
-}
-
-#[derive(Args)]
-struct Inspect {
-    /// Directory of the checkpoint
-    checkpoint: PathBuf,
-    /// Print JSON instead of text
-    #[arg(long)]
-    json: bool,
-}
-
-fn main() -> Result<ExitCode> {
-    let cli = Cli::parse();
+fn start(cli: Cli) -> Result<ExitCode> {
     if THREADS.iter().any(|name| env::var_os(name).is_none()) {
         // Read once by the libraries, before main could set them safely: so this program starts itself anew.
         let vars = THREADS.iter().filter(|name| env::var_os(name).is_none()).map(|name| (name, "1"));

@@ -2,6 +2,7 @@
 //! (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here the crank is turned.
 pub mod ceiling;
 pub mod dataset;
+pub mod flags;
 pub mod learner;
 pub mod log;
 pub mod optimizer;
@@ -14,9 +15,10 @@ mod ship;
 pub mod stage1;
 pub mod stage2;
 pub mod tensorboard;
+#[cfg(test)]
+mod tests;
 
-use crate::model::config::ModelConfig;
-use crate::model::diffusion::refine::LatentRouting;
+use crate::model::{config::ModelConfig, diffusion::refine::LatentRouting};
 use anyhow::{Result, bail, ensure};
 use dataset::{Split, hdf5};
 use learner::{Learner, Scalars};
@@ -144,12 +146,17 @@ impl Crank<'_> {
                 Stage::Latent => self.stage1(learner)?,
                 Stage::Refine => self.stage2(learner)?,
                 Stage::Done => {
-                    ship::ship(self.task, learner, self.out, &self.log)?;
+                    let metrics = ship::ship(self.task, learner, self.out)?;
+                    self.log.say(&format!("checkpoint in {}: {metrics:#}", self.out.display()));
                     return Ok(Outcome::Finished);
                 }
             };
             if outcome == Outcome::Stopped {
-                self.log.say(&format!("stopped at {} step {}; the same command goes on", learner.position.stage.name(), learner.position.step));
+                self.log.say(&format!(
+                    "stopped at {} step {}; the same command goes on",
+                    learner.position.stage.name(),
+                    learner.position.step
+                ));
                 return Ok(outcome);
             }
         }
@@ -230,7 +237,7 @@ impl Crank<'_> {
     fn checkpoint(&self, learner: &Learner) -> Result<()> {
         self.store.save(&learner.snapshot())?;
         if learner.position.stage == Stage::Refine {
-            ship::ship(self.task, learner, self.out, &self.log)?;
+            ship::ship(self.task, learner, self.out)?;
         }
         Ok(())
     }

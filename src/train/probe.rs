@@ -169,3 +169,58 @@ pub fn latent_probe(latent: &LatentModel, subjects: &Subjects, evidence: Evidenc
     };
     Ok(shifts.iter().map(line).collect())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{noise::Philox, trajectory::Layout};
+
+    /// Episodes whose context is white noise, so that no shift helps another.
+    fn episodes(count: usize, seed: u64) -> Vec<Episode> {
+        let mut rng = Philox::new(seed);
+        let layout = Layout { state_dim: 1, action_dim: 1 };
+        let mut noise = |len: usize| (0..len).map(|_| rng.normal()).collect::<Vec<f32>>();
+        let mut episode = || {
+            let (states, actions, rewards, context) = (noise(40), noise(40), noise(40), noise(80));
+            Episode { layout, context_dim: 2, states, actions, rewards, context }
+        };
+        (0..count).map(|_| episode()).collect()
+    }
+
+    /// Features that are the context of the step before, mixed and shifted: known exactly at shift -1, not at all at others.
+    fn lagged(episodes: &[Episode]) -> Features<'_> {
+        let places = places(episodes, usize::MAX);
+        let mut table = Table::new(2);
+        for (episode, t) in &places {
+            let context = t.checked_sub(1).map_or(&[9.0, 9.0][..], |before| episodes[*episode].context(before));
+            let (a, b) = (f64::from(context[0]), f64::from(context[1]));
+            table.values.extend([2.0 * a - b + 1.0, a + b]);
+        }
+        Features { episodes, places, table }
+    }
+
+    #[test]
+    fn the_probe_finds_the_shift() {
+        let (train, held_out) = (episodes(60, 1), episodes(20, 2));
+        let (fit, test) = (lagged(&train), lagged(&held_out));
+        let errors = [-1, 0, 1].map(|shift| score(&fit, &test, shift, 1, LAMBDA).0);
+        assert!(errors[0] < 1e-6 && errors[1] > 0.9 && errors[2] > 0.9, "{errors:?}");
+        let (settled, all) = score(&fit, &test, 0, 5, LAMBDA);
+        assert!(settled != all, "the first steps count in the second number only");
+    }
+
+    #[test]
+    fn places_are_spread_evenly() {
+        let episodes = episodes(10, 3);
+        assert_eq!(places(&episodes, usize::MAX).len(), 10 * 39);
+        let some = places(&episodes, 100);
+        assert!(some.len() <= 100 && some.len() > 90);
+        assert_eq!(some.last().unwrap().0, 9);
+    }
+
+    #[test]
+    fn spread_pools_the_dimensions() {
+        let table = Table { width: 2, values: vec![1.0, 0.0, -1.0, 0.0, 1.0, 4.0, -1.0, 4.0] };
+        assert!((spread(&table) - 5.0_f64.sqrt()).abs() < 1e-12);
+    }
+}

@@ -193,9 +193,10 @@ impl Recipe {
         Ok(recipe)
     }
 
-    /// The recipe as TOML, as it goes into the manifest.
+    /// The recipe as TOML, as it goes into the manifest: overrides included, of the data set's path only the name.
     pub fn to_toml(&self) -> String {
-        let mut table = toml::Table::try_from(self).expect("a recipe came from TOML: is a bug");
+        let data = self.data.file_name().map_or_else(|| self.data.clone(), PathBuf::from);
+        let mut table = toml::Table::try_from(Self { data, ..self.clone() }).expect("a recipe came from TOML: is a bug");
         if let (true, Some(sampler)) = (self.sampler.kappa.is_infinite(), table.get_mut("sampler").and_then(toml::Value::as_table_mut)) {
             // Infinity is serialised as null, which JSON needs and TOML leaves out.
             sampler.insert("kappa".into(), toml::Value::Float(f64::INFINITY));
@@ -250,7 +251,7 @@ impl Recipe {
                 require((0.0..=1.0).contains(&stage.show_action), "stage1.show_action", "must lie in 0..=1")?;
                 require((0.0..=1.0).contains(&stage.show_reward), "stage1.show_reward", "must lie in 0..=1")?;
                 require(stage.kl_weight.start >= 0.0 && stage.kl_weight.end >= 0.0, "stage1.kl_weight", "must not be negative")?;
-                check_rate("stage1.learning_rate", &stage.learning_rate, stage.steps)?;
+                check_rate("stage1.learning_rate", &stage.learning_rate)?;
                 require(self.gate.is_none_or(|gate| gate.tries >= 1), "gate.tries", "must be at least 1")
             }
             (None, None) => require(self.gate.is_none(), "gate", "needs model.latent"),
@@ -268,14 +269,13 @@ impl Recipe {
         require(stage.elbo_weight >= 0.0, "stage2.elbo_weight", "must not be negative")?;
         require(stage.elbo_weight == 0.0 || self.stage1.is_some(), "stage2.elbo_weight", "must be 0 without stage1")?;
         require(stage.latent_lr_factor >= 0.0, "stage2.latent_lr_factor", "must not be negative")?;
-        check_rate("stage2.learning_rate", &stage.learning_rate, stage.steps)
+        check_rate("stage2.learning_rate", &stage.learning_rate)
     }
 }
 
-fn check_rate(key: &str, rate: &LearningRate, steps: usize) -> Result<(), RecipeError> {
+fn check_rate(key: &str, rate: &LearningRate) -> Result<(), RecipeError> {
     require(rate.peak.is_finite() && rate.peak > 0.0, format!("{key}.peak"), "must be positive")?;
-    require(rate.end >= 0.0 && rate.end <= rate.peak, format!("{key}.end"), "must lie between 0 and the peak")?;
-    require(steps == 0 || rate.warm_up < steps, format!("{key}.warm_up"), format!("must be below the {steps} steps of the stage"))
+    require(rate.end >= 0.0 && rate.end <= rate.peak, format!("{key}.end"), "must lie between 0 and the peak")
 }
 
 fn require(holds: bool, key: impl Into<String>, reason: impl Into<String>) -> Result<(), RecipeError> {

@@ -89,7 +89,9 @@ pub fn inspect_text(value: &Value) -> String {
     let (config, provenance) = (&value["config"], &value["provenance"]);
     let mut text = format!("digest      {}\n", value["digest"].as_str().unwrap_or_default());
     let pair = |name: &str, value: &Value| format!("{name:<11} {value}\n");
-    for key in ["layout", "plan_horizon", "block_len", "obs_horizon", "level_max", "latent", "denoiser", "refined", "latent_spread", "sampler"] {
+    for key in
+        ["layout", "plan_horizon", "block_len", "obs_horizon", "level_max", "latent", "denoiser", "refined", "latent_spread", "sampler"]
+    {
         text += &pair(key, &config[key]);
     }
     text += &pair("parameters", &value["parameters"]);

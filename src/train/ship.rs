@@ -3,7 +3,6 @@
 use super::{
     Task,
     learner::Learner,
-    log::Log,
     probe::{Evidence, latent_means, places, spread},
     stage1,
     stage2::RefineTask,
@@ -21,11 +20,11 @@ use std::path::Path;
 /// Training positions over which the latent's spread is taken.
 const SPREAD_ROWS: usize = 4000;
 
-/// Writes the checkpoint of a learner into `out`.
+/// Writes the checkpoint of a learner into `out` and returns what was measured.
 ///
 /// # Errors
 /// If a tensor operation fails or the disk refuses.
-pub fn ship(task: &Task, learner: &Learner, out: &Path, log: &Log) -> Result<()> {
+pub fn ship(task: &Task, learner: &Learner, out: &Path) -> Result<Value> {
     let (networks, tensors) = learner.averaged(task)?;
     let latent_spread = networks.latent.as_ref().map_or(Ok(0.0), |latent| latent_spread(task, latent))?;
     let metrics = metrics(task, learner, &networks)?;
@@ -39,8 +38,7 @@ pub fn ship(task: &Task, learner: &Learner, out: &Path, log: &Log) -> Result<()>
         metrics: metrics.clone(),
     };
     save(out, &config, &tensors, &provenance)?;
-    log.say(&format!("checkpoint in {} after {} steps of stage 2; {metrics}", out.display(), learner.position.step));
-    Ok(())
+    Ok(metrics)
 }
 
 /// How far the prior's mean of c_tau moves over the training data: what the sampler holds a latent jump against.

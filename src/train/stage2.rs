@@ -36,11 +36,8 @@ impl<'a> RefineTask<'a> {
             action_horizon: sampler.action_horizon,
             ready_fraction: stage.ready_fraction,
         };
-        let options = RefineOptions {
-            routing: stage.routing,
-            first_action_weight: stage.first_action_weight,
-            sub_steps: sampler.sub_steps,
-        };
+        let options =
+            RefineOptions { routing: stage.routing, first_action_weight: stage.first_action_weight, sub_steps: sampler.sub_steps };
         let elbo = if stage.elbo_weight > 0.0 { ElboTask::new(task) } else { None };
         Self { task, places: shape.places(&task.split.train), shape, options, elbo }
     }

@@ -188,7 +188,9 @@ fn fit<'a>(episodes: impl Iterator<Item = &'a Episode> + Clone, layout: Layout, 
     let rewards: Vec<f32> = episodes.clone().flat_map(|episode| episode.rewards.iter().copied()).collect();
     let (state, reward) = (Affine::fit(&states, layout.state_dim), Affine::fit(&rewards, 1));
     let changes: Vec<f32> = episodes
-        .flat_map(|episode| (1..episode.len()).flat_map(move |t| episode.state(t).iter().zip(episode.state(t - 1)).map(|(next, now)| next - now)))
+        .flat_map(|episode| {
+            (1..episode.len()).flat_map(move |t| episode.state(t).iter().zip(episode.state(t - 1)).map(|(next, now)| next - now))
+        })
         .collect();
     let change = Affine::fit(&changes, layout.state_dim);
     let state_change_std = change.std.iter().zip(&state.std).map(|(change, state)| change / state).collect();

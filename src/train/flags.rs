@@ -1,0 +1,67 @@
+//! The command line of `ada-trainer`.
+
+use clap::{Args, Parser};
+use std::path::PathBuf;
+
+/// Train Ada-Diffuser: data set and recipe in, checkpoint out.
+///
+///   ada-trainer run models/point-wind-s/recipe.toml --out runs/point-wind-s
+///   ada-trainer probe runs/point-wind-s data/point-wind-s.h5
+///   ada-trainer inspect runs/point-wind-s
+///
+/// Data sets are HDF5 files in D4RL's layout, for example from `ada-collect`. A run that was stopped (Ctrl-C, kill -9) goes on by
+/// the same command, with the same bits as if it had never stopped.
+#[derive(Parser)]
+#[command(version, verbatim_doc_comment)]
+pub enum Cli {
+    /// Train a recipe, or go on with it: stage 1 (what cannot be seen), its gate, stage 2 (denoise and refine), checkpoint
+    Run(Run),
+    /// How well a checkpoint's latent knows the hidden context that a data set tells (infos/context)
+    Probe(Probe),
+    /// Check a checkpoint and say what it is: architecture, origin, recipe, measurements
+    Inspect(Inspect),
+}
+
+/// Flags of `run`.
+#[derive(Args)]
+pub struct Run {
+    /// The recipe; models/*/recipe.toml are examples with every key explained
+    pub recipe: PathBuf,
+    /// Training seed instead of the recipe's
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Where checkpoint, training state and logs (training/) go [default: runs/NAME-seedN]
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    /// HDF5 file instead of the recipe's
+    #[arg(long)]
+    pub data: Option<PathBuf>,
+    /// Another value for a key of the recipe, e.g. --set stage2.steps=100; may be given often
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub overrides: Vec<String>,
+    /// Stop after this many steps as if interrupted; the same command goes on
+    #[arg(long, value_name = "N")]
+    pub stop_after_steps: Option<usize>,
+}
+
+/// Flags of `probe`.
+#[derive(Args)]
+pub struct Probe {
+    /// Directory of the checkpoint
+    pub checkpoint: PathBuf,
+    /// HDF5 file with infos/context
+    pub data: PathBuf,
+    /// Print JSON instead of a table
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Flags of `inspect`.
+#[derive(Args)]
+pub struct Inspect {
+    /// Directory of the checkpoint
+    pub checkpoint: PathBuf,
+    /// Print JSON instead of text
+    #[arg(long)]
+    pub json: bool,
+}

@@ -1,0 +1,254 @@
+//! Whole runs on a small data set: what resumes, what is refused, what is shipped.
+
+use super::{Options, Outcome, Task, dataset::hdf5, probe, recipe::Recipe, resume, run};
+use crate::model::checkpoint;
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    sync::{Arc, atomic::AtomicBool},
+};
+
+const RECIPE: &str = r#"
+name = "small"
+seed = 3
+data = "tests/golden/data_good.h5"
+checkpoint_every = 4
+log_every = 2
+[model]
+plan_horizon = 4
+block_len = 3
+obs_horizon = 2
+level_max = 8
+state_clip = 5.0
+latent = { dim = 2, hidden = 4 }
+denoiser = { kind = "unet", widths = [8, 16] }
+[stage1]
+steps = 9
+batch = 4
+length = 5
+learning_rate = { peak = 3e-3, end = 1e-4, warm_up = 2, decay = "cosine" }
+weight_decay = 0.0
+kl_weight = { start = 0.01, end = 0.1, steps = 5 }
+reward_weight = 1.0
+show_action = 0.5
+show_reward = 0.5
+[stage2]
+steps = 9
+batch = 4
+learning_rate = { peak = 1e-3, end = 1e-4, warm_up = 2, decay = "linear" }
+weight_decay = 0.01
+latent_lr_factor = 0.1
+elbo_weight = 0.1
+routing = "matched"
+first_action_weight = 10.0
+ready_fraction = 0.5
+ema_decay_max = 0.995
+[sampler]
+streaming = true
+action_horizon = 2
+sub_steps = 2
+eta = 0.0
+temperature = 0.5
+kappa = inf
+latent = "mean"
+"#;
+
+fn recipe_with(overrides: &[&str]) -> Result<Recipe, super::recipe::RecipeError> {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("recipe.toml");
+    fs::write(&path, RECIPE).unwrap();
+    Recipe::read(&path, &overrides.iter().map(|text| text.to_string()).collect::<Vec<_>>())
+}
+
+/// A run in a thread with the stack that backward needs.
+fn train(overrides: &[&str], out: &Path, stop_after_steps: Option<usize>) -> anyhow::Result<Outcome> {
+    let (recipe, out) = (recipe_with(overrides).unwrap(), out.to_path_buf());
+    let options = Options { out, stop_after_steps, stop: Arc::new(AtomicBool::new(false)), clock: Box::new(|| 0.0) };
+    let worker = std::thread::Builder::new().stack_size(64 << 20).spawn(move || run(recipe, options)).unwrap();
+    worker.join().unwrap()
+}
+
+fn shipped(dir: &Path) -> [Vec<u8>; 2] {
+    ["model.safetensors", "config.json"].map(|name| fs::read(dir.join(name)).unwrap())
+}
+
+/// Stopped in the middle of each stage and between two checkpoints, and once thrown back to the last checkpoint as by kill -9,
+/// a run makes the same weights, config and log as one that was never stopped.
+#[test]
+fn a_stopped_run_goes_on_with_the_same_bits() {
+    let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    assert_eq!(train(&[], whole.path(), None).unwrap(), Outcome::Finished);
+    let state = parts.path().join("training/state.safetensors");
+    assert_eq!(train(&[], parts.path(), Some(5)).unwrap(), Outcome::Stopped);
+    let saved = fs::read(&state).unwrap();
+    assert_eq!(train(&[], parts.path(), Some(3)).unwrap(), Outcome::Stopped);
+    fs::write(&state, saved).unwrap();
+    for stop in [6, 3] {
+        assert_eq!(train(&[], parts.path(), Some(stop)).unwrap(), Outcome::Stopped);
+    }
+    assert_eq!(train(&[], parts.path(), None).unwrap(), Outcome::Finished);
+    assert!(shipped(whole.path()) == shipped(parts.path()), "the weights differ");
+    let steps = |dir: &Path| -> Vec<(String, u64)> {
+        let text = fs::read_to_string(dir.join("training/log.jsonl")).unwrap();
+        let key = |line: &str| {
+            let value: serde_json::Value = serde_json::from_str(line).unwrap();
+            (value["stage"].as_str().unwrap().to_string(), value["step"].as_u64().unwrap())
+        };
+        text.lines().map(key).collect()
+    };
+    assert_eq!(steps(whole.path()), steps(parts.path()));
+}
+
+/// Another seed makes other weights: the test above does not pass by a constant.
+#[test]
+fn seeds_make_different_weights() {
+    let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    for (dir, seed) in dirs.iter().zip(["seed=1", "seed=2"]) {
+        train(&[seed, "stage1.steps=1", "stage2.steps=2"], dir.path(), None).unwrap();
+    }
+    assert!(shipped(dirs[0].path())[0] != shipped(dirs[1].path())[0]);
+}
+
+#[test]
+fn what_is_shipped_loads_and_says_where_it_comes_from() {
+    let dir = tempfile::tempdir().unwrap();
+    train(&["stage1.steps=2", "stage2.steps=3"], dir.path(), None).unwrap();
+    let agent = checkpoint::load(dir.path()).unwrap();
+    assert!(agent.spec().refined);
+    assert_eq!((agent.config().layout.state_dim, agent.config().layout.action_dim), (3, 2));
+    assert!(agent.config().latent_spread > 0.0);
+    let (manifest, _) = checkpoint::load_manifest(dir.path()).unwrap();
+    let provenance = manifest.provenance;
+    assert_eq!((provenance.dataset.as_str(), provenance.seed), ("data_good.h5", 3));
+    assert!(provenance.recipe.contains("kappa = inf") && provenance.recipe.contains("data = \"data_good.h5\""), "{}", provenance.recipe);
+    let rows = provenance.metrics["held_out_error_by_row"].as_array().unwrap().len();
+    assert_eq!(rows, 2 * 4, "one error for each row of the ladder");
+    let scores = super::report::probe(dir.path(), Path::new("tests/golden/data_good.h5")).unwrap();
+    let ceiling = scores.iter().find(|score| score.source == "ceiling" && score.evidence == probe::Evidence::SuccessorState).unwrap();
+    assert!(ceiling.error < 0.05, "the push is in every transition: {ceiling:?}");
+}
+
+/// A model without latents has no stage 1, and is not said to be refined.
+#[test]
+fn a_baseline_skips_stage_1() {
+    let text = RECIPE.replace("latent = { dim = 2, hidden = 4 }\n", "").replace("elbo_weight = 0.1", "elbo_weight = 0.0");
+    let (start, end) = (text.find("[stage1]").unwrap(), text.find("[stage2]").unwrap());
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("recipe.toml");
+    fs::write(&path, format!("{}{}", &text[..start], &text[end..])).unwrap();
+    let recipe = Recipe::read(&path, &["stage2.steps=2".to_string()]).unwrap();
+    let out = dir.path().join("out");
+    let options = Options { out: out.clone(), stop_after_steps: None, stop: Arc::default(), clock: Box::new(|| 0.0) };
+    assert_eq!(run(recipe, options).unwrap(), Outcome::Finished);
+    let agent = checkpoint::load(&out).unwrap();
+    assert!(!agent.spec().refined && agent.networks().latent.is_none());
+}
+
+/// A learning rate that makes the loss NaN: the run ends with one error, and the state of the last checkpoint is still there.
+#[test]
+fn a_loss_that_diverges_keeps_the_last_good_state() {
+    let dir = tempfile::tempdir().unwrap();
+    let wild = ["stage1.steps=40", "stage1.learning_rate.peak=1e38", "stage1.learning_rate.warm_up=5", "checkpoint_every=1"];
+    let error = train(&wild, dir.path(), None).unwrap_err().to_string();
+    assert!(error.contains("stage1 step") && error.contains("last good state"), "{error}");
+    let recipe = recipe_with(&wild).unwrap();
+    let task = Task::new(recipe.clone()).unwrap();
+    let identity = resume::Identity { recipe: recipe.to_toml(), dataset: task.dataset_digest };
+    let state = resume::Store::new(&dir.path().join("training"), identity).load().unwrap().unwrap();
+    for (name, tensor) in state.tensors {
+        let values: Vec<f32> = tensor.flatten_all().unwrap().to_vec1().unwrap();
+        assert!(values.iter().all(|value| value.is_finite()), "{name}");
+    }
+}
+
+/// A gate that nothing passes: stage 1 is tried as often as the recipe says, from other seeds, and then the run says what it saw.
+#[test]
+fn the_gate_restarts_stage_1_and_gives_up() {
+    let dir = tempfile::tempdir().unwrap();
+    let gate = ["gate.filter=0.0", "gate.successor_state=0.0", "gate.tries=2", "stage1.steps=2"];
+    let error = train(&gate, dir.path(), None).unwrap_err().to_string();
+    assert!(error.contains("in 2 tries"), "{error}");
+    let log = fs::read_to_string(dir.path().join("training/log.jsonl")).unwrap();
+    assert_eq!(log.lines().filter(|line| line.contains("probe_filter")).count(), 2);
+    assert!(log.contains("\"attempt\":1"));
+}
+
+#[test]
+fn a_state_of_another_recipe_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    train(&[], dir.path(), Some(1)).unwrap();
+    let error = train(&["stage2.batch=5"], dir.path(), Some(1)).unwrap_err().to_string();
+    assert!(error.contains("another recipe"), "{error}");
+}
+
+#[test]
+fn wrong_recipes_name_the_key() {
+    for (text, key) in [
+        ("stage2.bacth=3", "bacth"),
+        ("stage2.steps=many", "steps"),
+        ("model.level_max=7", "model.level_max"),
+        ("model.plan_horizon=5", "model.denoiser.widths"),
+        ("sampler.action_horizon=5", "sampler.action_horizon"),
+        ("sampler.kappa=-1.0", "sampler.kappa"),
+        ("stage2.ready_fraction=1.5", "stage2.ready_fraction"),
+        ("stage1.learning_rate.end=1.0", "stage1.learning_rate.end"),
+        ("stage2.routing=leaky", "leaky"),
+        ("steps", "--set steps"),
+    ] {
+        let error = recipe_with(&[text]).unwrap_err().to_string();
+        assert!(error.contains(key), "{text}: {error}");
+    }
+    let missing = recipe_with(&["model.latent=3"]).unwrap_err().to_string();
+    assert!(missing.contains("latent"), "{missing}");
+}
+
+/// The recipes that ship with the repository are read and checked by the same code.
+#[test]
+fn shipped_recipes_are_right() {
+    let mut count = 0;
+    for entry in fs::read_dir("models").unwrap() {
+        let path: PathBuf = entry.unwrap().path().join("recipe.toml");
+        if path.exists() {
+            Recipe::read(&path, &[]).unwrap_or_else(|error| panic!("{error}"));
+            count += 1;
+        }
+    }
+    assert!(count >= 3);
+}
+
+/// 64-bit numbers, and the same file in 32 bits, are one data set; episodes end by terminals and by timeouts.
+#[test]
+fn data_sets_are_read_and_split() {
+    let [single, double] = ["data_good", "data_f64"].map(|file| hdf5::read(Path::new(&format!("tests/golden/{file}.h5"))).unwrap());
+    assert_eq!(single.episodes, double.episodes);
+    assert_ne!(single.digest, double.digest);
+    assert_eq!((single.episodes.len(), single.context_dim), (12, 1));
+    assert!(single.episodes.iter().all(|episode| episode.len() == 24 && episode.context.iter().all(|push| *push == episode.context[0])));
+    let split = single.split(None);
+    assert_eq!((split.train.len(), split.held_out.len()), (10, 2));
+    let states: Vec<f32> = split.train.iter().flat_map(|episode| episode.states.iter().step_by(3).copied()).collect();
+    let mean = states.iter().sum::<f32>() / states.len() as f32;
+    let var = states.iter().map(|state| (state - mean).powi(2)).sum::<f32>() / states.len() as f32;
+    assert!(mean.abs() < 1e-5 && (var - 1.0).abs() < 1e-4, "{mean} {var}");
+    assert_eq!(split.normalizer.action.mean, [0.0, 0.0]);
+    assert_eq!(split.action_bounds, (vec![-1.0, -1.0], vec![1.0, 1.0]));
+}
+
+#[test]
+fn wrong_data_sets_are_refused_before_training() {
+    for (file, words) in [
+        ("data_no_actions", "actions"),
+        ("data_ragged", "`rewards`: 285 rows, but `observations` has 288"),
+        ("data_flat", "`observations`: shape"),
+        ("data_whole_numbers", "`actions`: type"),
+        ("data_nan", "`observations`: NaN at row 30, column 2"),
+        ("make_h5", "make_h5"),
+        ("nowhere", "nowhere"),
+    ] {
+        let extension = if file == "make_h5" { "py" } else { "h5" };
+        let error = Task::new(recipe_with(&[&format!("data=\"tests/golden/{file}.{extension}\"")]).unwrap()).err().unwrap().to_string();
+        assert!(error.contains(words) && error.contains(file), "{file}: {error}");
+    }
+    let error = Task::new(recipe_with(&["stage1.length=30"]).unwrap()).err().unwrap().to_string();
+    assert!(error.contains("episode 0 has 24 steps") && error.contains("`stage1.length`"), "{error}");
+}
