@@ -211,12 +211,7 @@ async fn messages_that_are_too_large_or_none() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_full_queue_and_passed_deadlines() {
-    let server = start(|config| {
-        config.engine.workers = 1;
-        config.engine.batch_len_max = 1;
-        config.engine.queue_len_max = 1;
-    })
-    .await;
+    let (_process, server) = start_process(&["engine.workers=1", "engine.queue_len_max=1"]).await;
     let (running, waiting, third) =
         (server.open(json!({"model": "slow"})).await, server.open(json!({})).await, server.open(json!({})).await);
     let hasty = |id: &str, ms| pb::ActRequest { deadline_ms: Some(ms), ..act(id, 1, &STATE) };

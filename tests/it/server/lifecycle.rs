@@ -3,12 +3,7 @@
 use super::*;
 use ada_diffuser::serve::{grpc, http, service::Service, telemetry};
 use axum::{Router, http::Request};
-use std::{
-    io::{BufRead, BufReader},
-    process::{Child, Command, Stdio},
-    sync::Arc,
-    time::Instant,
-};
+use std::{process::Command, sync::Arc, time::Instant};
 use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
 use tower::ServiceExt;
 
@@ -133,38 +128,13 @@ async fn the_faces_describe_themselves() {
     assert_eq!(own.len(), 36);
 }
 
-struct Process(Child);
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        // It may have ended already.
-        let _ended = self.0.kill();
-    }
-}
-
-/// `ada-server` as a user starts it, with a free port; its process and address.
-fn spawn(extra: &[&str], environment: &[(&str, &str)]) -> (Process, SocketAddr) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ada-server"));
-    command.args(["--listen", "127.0.0.1:0", "--default-model", "tiny", "--set", "telemetry.format=json", "--models"]);
-    command.arg(models_dir()).args(extra).envs(environment.iter().copied());
-    command.env_remove("RAYON_NUM_THREADS").env_remove("CANDLE_NUM_THREADS");
-    let mut process = Process(command.stderr(Stdio::piped()).spawn().unwrap());
-    let mut lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
-    let line = lines.by_ref().map(Result::unwrap).find(|line| line.contains("\"listening\"")).expect("it ended before it listened");
-    std::thread::spawn(move || lines.for_each(drop));
-    let event: Value = serde_json::from_str(&line).unwrap();
-    (process, event["address"].as_str().unwrap().parse().unwrap())
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn the_binary_ends_well_on_a_signal() {
     for signal in ["TERM", "INT"] {
-        let (mut process, address) = spawn(&["--set", "server.drain_notice_ms=0"], &[("ADA__ENGINE__WORKERS", "1")]);
+        let (mut process, server) = start_process(&["server.drain_notice_ms=0"]).await;
         let environment = std::fs::read(format!("/proc/{}/environ", process.0.id())).unwrap();
         let environment = String::from_utf8_lossy(&environment).into_owned();
         assert!(environment.contains("RAYON_NUM_THREADS=1") && environment.contains("CANDLE_NUM_THREADS=1"));
-        let server = Running { address, stop: CancellationToken::new(), done: tokio::spawn(async { Ok(()) }) };
-        while server.get("/readyz").await.status != 200 {}
         let id = server.open(json!({})).await;
         assert_eq!(server.act(&id, 1, &STATE).await.status, 200);
         let begin = Instant::now();

@@ -24,7 +24,15 @@ use ada_diffuser::{
 use axum::body::{Body, to_bytes};
 use hyper_util::rt::TokioIo;
 use serde_json::{Value, json};
-use std::{fs, net::SocketAddr, path::Path, path::PathBuf, sync::OnceLock, time::Duration};
+use std::{
+    fs,
+    io::{BufRead, BufReader},
+    net::SocketAddr,
+    path::{Path, PathBuf},
+    process::{Child, Command, Stdio},
+    sync::OnceLock,
+    time::Duration,
+};
 use tokio::{net::TcpStream, task::JoinHandle, time::timeout};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status, transport::Channel};
@@ -105,13 +113,35 @@ pub async fn start(adjust: impl FnOnce(&mut Config)) -> Running {
     let stop = CancellationToken::new();
     let done = tokio::spawn(server.run(stop.clone().cancelled_owned()));
     let running = Running { address, stop, done };
-    for _ in 0..500 {
-        if running.get("/readyz").await.status == 200 {
-            return running;
-        }
-        tokio::time::sleep(Duration::from_millis(10)).await;
+    running.ready().await;
+    running
+}
+
+/// A process that ends with its test.
+pub struct Process(pub Child);
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // It may have ended already.
+        let _ended = self.0.kill();
     }
-    panic!("the server did not become ready")
+}
+
+/// `ada-server` as a user starts it, on a free port, ready. Its metrics are its own, while servers of one process share theirs.
+pub async fn start_process(settings: &[&str]) -> (Process, Running) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ada-server"));
+    command.args(["--listen", "127.0.0.1:0", "--default-model", "tiny", "--set", "telemetry.format=json", "--models"]).arg(models_dir());
+    command.args(settings.iter().flat_map(|setting| ["--set", setting]));
+    command.env("ADA__ENGINE__BATCH_LEN_MAX", "1").env_remove("RAYON_NUM_THREADS").env_remove("CANDLE_NUM_THREADS");
+    let mut process = Process(command.stderr(Stdio::piped()).spawn().unwrap());
+    let mut lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
+    let line = lines.by_ref().map(Result::unwrap).find(|line| line.contains("\"listening\"")).expect("it ended before it listened");
+    std::thread::spawn(move || lines.for_each(drop));
+    let event: Value = serde_json::from_str(&line).unwrap();
+    let address = event["address"].as_str().unwrap().parse().unwrap();
+    let running = Running { address, stop: CancellationToken::new(), done: tokio::spawn(async { Ok(()) }) };
+    running.ready().await;
+    (process, running)
 }
 
 /// An HTTP answer.
@@ -135,6 +165,16 @@ impl Reply {
 }
 
 impl Running {
+    async fn ready(&self) {
+        for _ in 0..500 {
+            if self.get("/readyz").await.status == 200 {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        panic!("the server did not become ready")
+    }
+
     pub async fn channel(&self) -> Channel {
         Channel::from_shared(format!("http://{}", self.address)).unwrap().connect().await.unwrap()
     }
