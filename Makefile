@@ -47,8 +47,10 @@ lint: venv ## Formatting, clippy, docs and ruff, all with warnings as errors.
 bench: ## Kernel, forward, act and training-step times of this machine.
 	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 cargo bench --locked
 
-proto-python: venv ## Writes the Python stubs anew from proto/.
-	$(BIN)/python -m grpc_tools.protoc -I proto --python_out=clients/python --grpc_python_out=clients/python --pyi_out=clients/python proto/ada_diffuser/v1/*.proto
+proto-python: tools ## Writes the Python stubs anew from proto/, with the lowest version that clients may have.
+	$(PYTHON) -m venv target/proto-venv
+	target/proto-venv/bin/pip install --quiet --disable-pip-version-check grpcio-tools==1.72.2
+	target/proto-venv/bin/python -m grpc_tools.protoc -I proto --python_out=clients/python --grpc_python_out=clients/python --pyi_out=clients/python proto/ada_diffuser/v1/*.proto
 
 .PHONY: build venv
 build: tools

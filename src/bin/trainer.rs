@@ -35,6 +35,7 @@ fn start(cli: Cli) -> Result<ExitCode> {
         Cli::Run(flags) => run(flags),
         Cli::Probe(flags) => probe(&flags),
         Cli::Inspect(flags) => inspect(&flags),
+        Cli::Defaults(flags) => train::defaults::defaults(&flags).map(|()| ExitCode::SUCCESS),
     })?;
     worker.join().map_err(|_| anyhow!("the training thread panicked; the last state on disk is good"))?
 }

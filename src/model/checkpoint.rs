@@ -120,6 +120,19 @@ pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
     Ok(Agent::new(config, networks, digest))
 }
 
+/// Writes the checkpoint of `dir` into `out` with the same weights and origin and another configuration, e.g. other sampling defaults.
+///
+/// # Errors
+/// As [`load`] and [`save`].
+pub fn copy_with(dir: &Path, out: &Path, config: &ModelConfig) -> Result<(), CheckpointError> {
+    load(dir)?;
+    let (manifest, _) = load_manifest(dir)?;
+    let path = dir.join(WEIGHTS);
+    let tensors = read_tensors(&read(&path, WEIGHT_BYTES_MAX)?, &manifest).map_err(|reason| invalid(&path, reason))?;
+    save(out, config, &tensors, &manifest.provenance)?;
+    load(out).map(|_| ())
+}
+
 /// The manifest of a checkpoint and its own SHA-256, which names the checkpoint.
 ///
 /// # Errors
@@ -140,9 +153,8 @@ fn serialize_tensors(tensors: &BTreeMap<String, Tensor>) -> Result<(Vec<u8>, BTr
         let values = tensor.flatten_all().and_then(|flat| flat.to_vec1::<f32>()).map_err(|error| format!("{name}: {error}"))?;
         bytes.push((name.clone(), tensor.dims().to_vec(), values.iter().flat_map(|value| value.to_le_bytes()).collect()));
     }
-    let digest = |(name, shape, bytes): &(String, Vec<usize>, Vec<u8>)| {
-        (name.clone(), TensorDigest { shape: shape.clone(), sha256: sha256(bytes) })
-    };
+    let digest =
+        |(name, shape, bytes): &(String, Vec<usize>, Vec<u8>)| (name.clone(), TensorDigest { shape: shape.clone(), sha256: sha256(bytes) });
     let digests = bytes.iter().map(digest).collect();
     let views = bytes.iter().map(|(name, shape, bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)));
     let views = views.collect::<Result<Vec<_>, safetensors::SafeTensorError>>().map_err(|error| error.to_string())?;
@@ -163,7 +175,12 @@ fn read_tensors(bytes: &[u8], manifest: &Manifest) -> Result<BTreeMap<String, Te
         let expected = manifest.tensors.get(&name).ok_or_else(|| format!("tensor {name} is not in the manifest"))?;
         let found = TensorDigest { shape: view.shape().to_vec(), sha256: sha256(view.data()) };
         if view.dtype() != Dtype::F32 || found != *expected {
-            return Err(format!("tensor {name} is {:?} {:?}, the manifest has F32 {:?} with another digest", view.dtype(), found.shape, expected.shape));
+            return Err(format!(
+                "tensor {name} is {:?} {:?}, the manifest has F32 {:?} with another digest",
+                view.dtype(),
+                found.shape,
+                expected.shape
+            ));
         }
         let values: Vec<f32> = view.data().chunks_exact(4).map(|four| f32::from_le_bytes([four[0], four[1], four[2], four[3]])).collect();
         if values.iter().any(|value| !value.is_finite()) {

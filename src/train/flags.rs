@@ -8,6 +8,7 @@ use std::path::PathBuf;
 ///   ada-trainer run models/point-wind-s/recipe.toml --out runs/point-wind-s
 ///   ada-trainer probe runs/point-wind-s data/point-wind-s.h5
 ///   ada-trainer inspect runs/point-wind-s
+///   ada-trainer defaults runs/point-wind-s models/point-wind-s --set sampler.kappa=0.1
 ///
 /// Data sets are HDF5 files in D4RL's layout, for example from `ada-collect`. A run that was stopped (Ctrl-C, kill -9) goes on by
 /// the same command, with the same bits as if it had never stopped.
@@ -20,6 +21,8 @@ pub enum Cli {
     Probe(Probe),
     /// Check a checkpoint and say what it is: architecture, origin, recipe, measurements
     Inspect(Inspect),
+    /// Copy a checkpoint with other sampling defaults, chosen on validation episodes
+    Defaults(Defaults),
 }
 
 /// Flags of `run`.
@@ -64,4 +67,16 @@ pub struct Inspect {
     /// Print JSON instead of text
     #[arg(long)]
     pub json: bool,
+}
+
+/// Flags of `defaults`.
+#[derive(Args)]
+pub struct Defaults {
+    /// Directory of the checkpoint
+    pub checkpoint: PathBuf,
+    /// Directory to write to; may be the same
+    pub out: PathBuf,
+    /// Another value for a key of config.json's `sampler` or `restart`, e.g. --set sampler.kappa=inf; may be given often
+    #[arg(long = "set", value_name = "KEY=VALUE", required = true)]
+    pub overrides: Vec<String>,
 }

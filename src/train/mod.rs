@@ -2,6 +2,7 @@
 //! (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here the crank is turned.
 pub mod ceiling;
 pub mod dataset;
+pub mod defaults;
 pub mod flags;
 pub mod learner;
 pub mod log;

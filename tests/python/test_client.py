@@ -201,7 +201,7 @@ def test_the_broker_hands_out_and_reports(client: Client, core: Core) -> None:
         for step in range(4):
             action = broker.action([float(step), 0.0])
             assert action.shape == (2,)
-            broker.record(reward=step + 1.0)
+            broker.report(reward=step + 1.0)
         assert session.committed_step == 2 and not broker.due
         broker.replan()
         broker.action([9.0, 0.0])
@@ -215,7 +215,7 @@ def test_the_broker_tells_states_and_other_actions(core: Core) -> None:
         broker = ChunkBroker(session)
         for step in range(3):
             broker.action([float(step), 0.5])
-        broker.record(action=[0.125, 0.25])
+        broker.report(action=[0.125, 0.25])
         broker.action([3.0, 0.5])
     first, second, third = core.seen[1][2]["executed"]  # type: ignore[index]
     assert "state" not in first, "it is the state of the observation before"

@@ -4,7 +4,7 @@ broker = ChunkBroker(session)
 for _ in range(200):
     action = broker.action(state)                       # acts only when the chunk is used up
     state, reward, *_ = env.step(action)
-    broker.record(reward=reward)                        # told to the model at the next act
+    broker.report(reward=reward)                        # told to the model at the next act
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class ChunkBroker:
         self._next += 1
         return action.copy()
 
-    def record(self, *, reward: float | None = None, action: ArrayLike | None = None) -> None:
+    def report(self, *, reward: float | None = None, action: ArrayLike | None = None) -> None:
         """What became of the action handed out last: its reward, and the action itself where another one was executed."""
         if not self._executed:
             raise RuntimeError("no action was handed out since the last act")

@@ -103,9 +103,11 @@ impl Agent {
         let x = tensor(descents.iter().flat_map(|descent| descent.x.iter().copied()).collect(), (batch, horizon, dim))?;
         let levels = descents.iter().zip(walks).flat_map(|(descent, walk)| walk.ladder.row(descent.row));
         let levels = tensor(levels.map(|level| level as f32).collect(), (batch, horizon, 1))?.squeeze(2)?;
-        let latents = self.config.latent.as_ref().map(|latent| {
-            tensor(descents.iter().flat_map(|descent| descent.latents(horizon)).collect(), (batch, horizon, latent.dim))
-        });
+        let latents = self
+            .config
+            .latent
+            .as_ref()
+            .map(|latent| tensor(descents.iter().flat_map(|descent| descent.latents(horizon)).collect(), (batch, horizon, latent.dim)));
         let observed = (self.config.obs_horizon > 1).then(|| {
             let rows: Vec<f32> = descents.iter().flat_map(|descent| self.observed(descent)).collect();
             let width = rows.len() / batch;

@@ -117,7 +117,8 @@ impl Descent {
     fn choose_start(&self, window: &Window, config: &ModelConfig) -> Start {
         let restart = &config.restart;
         let distance = rms(&self.state, &window.predicted_state);
-        let moved = self.chain.first().map_or(0.0, |latent| norm(&latent.mean, &window.anchor) / config.latent_spread.max(f32::MIN_POSITIVE));
+        let moved =
+            self.chain.first().map_or(0.0, |latent| norm(&latent.mean, &window.anchor) / config.latent_spread.max(f32::MIN_POSITIVE));
         let rungs = (config.plan_horizon / 4).clamp(1, config.plan_horizon.saturating_sub(1).max(1));
         if distance >= restart.cold_distance || moved > restart.latent_jump {
             Start::Cold

@@ -126,7 +126,10 @@ impl Agent {
             return invalid("kappa", format!("{} is not 0 (off) or above", options.kappa));
         }
         if options.kappa > 0.0 && self.config.latent.is_some() && !self.config.refined {
-            return invalid("kappa", "this checkpoint was not trained with refinement, and zig-zag would harm it; only 0 is allowed".into());
+            return invalid(
+                "kappa",
+                "this checkpoint was not trained with refinement, and zig-zag would harm it; only 0 is allowed".into(),
+            );
         }
         Ok(())
     }

@@ -14,15 +14,7 @@ use crate::model::{
 const HORIZON: usize = 8;
 
 fn options() -> SamplerOptions {
-    SamplerOptions {
-        streaming: true,
-        action_horizon: 1,
-        sub_steps: 1,
-        eta: 0.0,
-        temperature: 0.5,
-        kappa: 0.1,
-        latent: LatentMode::Mean,
-    }
+    SamplerOptions { streaming: true, action_horizon: 1, sub_steps: 1, eta: 0.0, temperature: 0.5, kappa: 0.1, latent: LatentMode::Mean }
 }
 
 fn agent(latents: bool, obs_horizon: usize, denoiser: DenoiserConfig) -> Agent {
@@ -221,4 +213,87 @@ fn bad_options_name_the_field() {
     assert_eq!(field(&agent, SamplerOptions { kappa: -1.0, ..options() }), "kappa");
     agent.config.refined = false;
     assert_eq!(field(&agent, options()), "kappa");
+}
+
+/// With a window of one position and no latents the ladder is the plain sampler of Diffuser (all positions at one level): a textbook
+/// DDIM and DDPM loop over the same network and noise.
+#[test]
+fn one_position_is_the_plain_sampler() {
+    let mut agent = agent(false, 1, DenoiserConfig::Dit { width: 16, depth: 1, heads: 2 });
+    agent.config.plan_horizon = 1;
+    for eta in [0.0, 1.0] {
+        let options = SamplerOptions { sub_steps: 10, eta, ..options() };
+        let state = [0.4, -0.1, 0.2];
+        let observation = Observation { state: state.to_vec(), executed: Vec::new() };
+        let (_, chunk) = agent.act(&agent.open(3, &options).unwrap(), &observation).unwrap();
+        let expected = plain_sampler(&agent, &agent.config.normalizer.state.normalize(&state), &options);
+        assert_eq!(chunk.evaluations, 10);
+        for (got, expected) in chunk.actions[0].iter().zip(expected) {
+            assert!((f64::from(*got) - expected).abs() < 1e-4, "eta {eta}: {got} against {expected}");
+        }
+    }
+}
+
+/// Ten steps from level 40 to 0 for one position, in f64, in the form of posterior mean and variance (Ho et al. 2020, eq. 6 and 7, over a gap).
+fn plain_sampler(agent: &Agent, state: &[f32], options: &SamplerOptions) -> Vec<f64> {
+    use crate::model::{
+        denoiser::Condition,
+        noise::{Noise, Slot},
+    };
+    use candle_core::{Device, Tensor};
+    let noise = Noise::new(3);
+    let draw = |level, slot| {
+        let mut out = [0.0; 5];
+        noise.fill(0, level, slot, &mut out);
+        out.map(|value| f64::from(value * options.temperature))
+    };
+    let mut x = draw(u32::MAX, Slot::Window);
+    for step in (1..=10).rev() {
+        let (from, to) = (4 * step, 4 * (step - 1));
+        (0..3).for_each(|column| x[column] = f64::from(state[column]));
+        let input = Tensor::from_vec(x.iter().map(|v| *v as f32).collect(), (1, 1, 5), &Device::Cpu).unwrap();
+        let levels = Tensor::from_vec(vec![from as f32], (1, 1), &Device::Cpu).unwrap();
+        let condition = Condition { levels: &levels, latents: None, observed: None };
+        let x0: Vec<f32> = agent.networks.denoiser.predict(&input, &condition).unwrap().flatten_all().unwrap().to_vec1().unwrap();
+        let (a, b) = (agent.process.alpha_bar(from), agent.process.alpha_bar(to));
+        let z = draw((step - 1) as u32, Slot::Jump);
+        for column in 0..5 {
+            let bound = if column < 3 { 5.0 } else { 1.0 };
+            let x0 = f64::from(x0[column]).clamp(-bound, bound);
+            x[column] = if options.eta == 0.0 {
+                b.sqrt() * x0 + (1.0 - b).sqrt() * (x[column] - a.sqrt() * x0) / (1.0 - a).sqrt()
+            } else {
+                let beta = 1.0 - a / b;
+                let mean = b.sqrt() * beta / (1.0 - a) * x0 + (1.0 - beta).sqrt() * (1.0 - b) / (1.0 - a) * x[column];
+                mean + ((1.0 - b) / (1.0 - a) * beta).sqrt() * z[column]
+            };
+        }
+    }
+    x[3..].to_vec()
+}
+
+/// In every row position 0 holds the real state exactly; each action of a chunk is refined once, on tokens at rungs 1 and 2.
+#[test]
+fn rows_hold_the_real_state_and_refine_once_an_action() {
+    let agent = agent(true, 1, unet());
+    let options = SamplerOptions { sub_steps: 2, action_horizon: 3, ..options() };
+    let mut stream = Philox::new(1);
+    let mut descents = [agent.begin(&agent.open(1, &options).unwrap(), &observation(&mut stream)).unwrap()];
+    let ladder = Ladder::new(HORIZON, 2, 40).unwrap();
+    let (mut refined, mut emitted) = (0, 0);
+    while !descents[0].is_done() {
+        if descents[0].has_started() && descents[0].wants_refinement(&ladder) {
+            let walk = super::descent::Walk { config: &agent.config, process: &agent.process, ladder };
+            let noise = [0, 1].map(|position| descents[0].noisy_token(position, &walk).noise);
+            assert_eq!(noise, [ladder.level(2), ladder.level(4)].map(|level| agent.process.sigma(level)));
+            refined += 1;
+        }
+        agent.advance(&mut descents).unwrap();
+        let imagined = descents[0].block.len() > descents[0].episode.history.len();
+        emitted = descents[0].block.len() - descents[0].episode.history.len();
+        if !imagined {
+            assert_eq!(descents[0].x[..3], descents[0].state[..]);
+        }
+    }
+    assert_eq!((refined, emitted), (3, 3));
 }

@@ -5,12 +5,7 @@ mod unet;
 
 use crate::model::{
     config::ModelConfig,
-    nn::{
-        Linear,
-        params::Params,
-        silu,
-        time_embedding::sinusoid,
-    },
+    nn::{Linear, params::Params, silu, time_embedding::sinusoid},
 };
 use candle_core::{D, Result, Tensor};
 use dit::Dit;

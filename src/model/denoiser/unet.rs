@@ -85,7 +85,8 @@ impl Unet {
         let (Some(&top), Some(&bottom)) = (widths.first(), widths.last()) else { candle_core::bail!("a U-Net needs at least one width") };
         let c_in = std::iter::once(d_in).chain(widths.iter().copied());
         let pairs: Vec<(usize, usize)> = c_in.zip(widths.iter().copied()).collect();
-        let down = pairs.iter().enumerate().map(|(j, (a, b))| Self::new_down([*a, *b], j + 1 == pairs.len(), &params.scope("down").scope(j)));
+        let down =
+            pairs.iter().enumerate().map(|(j, (a, b))| Self::new_down([*a, *b], j + 1 == pairs.len(), &params.scope("down").scope(j)));
         let up = pairs.iter().skip(1).rev().enumerate().map(|(j, (a, b))| Self::new_up([*a, *b], &params.scope("up").scope(j)));
         Ok(Self {
             time: [Linear::new(EMB, 4 * EMB, &params.scope("time.0"))?, Linear::new(4 * EMB, EMB, &params.scope("time.2"))?],

@@ -5,7 +5,7 @@
 //! and takes in a fresh position at pure noise is at READY again, so streaming and cold starts walk the same table.
 
 /// Levels of every position in every row.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Ladder {
     horizon: usize,
     sub_steps: usize,
@@ -73,6 +73,19 @@ mod tests {
         let expected = [[4, 4, 4, 4], [3, 4, 4, 4], [2, 3, 4, 4], [1, 2, 3, 4], [0, 1, 2, 3], [0, 0, 1, 2], [0, 0, 0, 1], [0, 0, 0, 0]];
         assert_eq!(rows, expected.map(|row| row.to_vec()));
         assert_eq!((ladder.ready(), ladder.emit()), (3, 4));
+    }
+
+    /// With one sub-step a level, the ladder is the pyramid of diffusion forcing (Chen et al. 2024): a matrix of
+    /// `K + (T - 1) u + 1` rows in which position i starts `i u` rows late, with `u = K / T`.
+    #[test]
+    fn full_resolution_is_the_pyramid() {
+        let (horizon, level_max, delay) = (4, 20, 5);
+        let ladder = Ladder::new(horizon, delay, level_max).unwrap();
+        assert_eq!(ladder.end() + 1, level_max + (horizon - 1) * delay + 1);
+        for m in 0..=ladder.end() {
+            let pyramid: Vec<i64> = (0..4).map(|i| (20 + i * 5 - m as i64).clamp(0, 20)).collect();
+            assert_eq!(ladder.row(m), pyramid.into_iter().map(|level| level as usize).collect::<Vec<_>>());
+        }
     }
 
     #[test]

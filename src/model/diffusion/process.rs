@@ -93,7 +93,8 @@ mod tests {
             let (now, before) = (process.alpha_bar(k), process.alpha_bar(k - 1));
             let beta = 1.0 - now / before;
             let (x, x0) = (0.7_f32, -0.3_f32);
-            let mean = before.sqrt() * beta / (1.0 - now) * f64::from(x0) + (1.0 - beta).sqrt() * (1.0 - before) / (1.0 - now) * f64::from(x);
+            let mean =
+                before.sqrt() * beta / (1.0 - now) * f64::from(x0) + (1.0 - beta).sqrt() * (1.0 - before) / (1.0 - now) * f64::from(x);
             let variance = beta * (1.0 - before) / (1.0 - now);
             let jump = process.jump(k, k - 1, 1.0);
             let got = jump.x0 * x0 + jump.eps * process.eps(k, x, x0);

@@ -60,7 +60,12 @@ fn values(seed: u64) -> Vec<f32> {
 }
 
 fn batch(window: Vec<f32>, noise: Vec<f32>, row: usize) -> WindowBatch {
-    let token = |i: usize| Token { state: Some(vec![i as f32 * 0.1; STATE]), action: Some(vec![0.3, -0.1 * i as f32]), reward: Some(0.2), noise: 0.0 };
+    let token = |i: usize| Token {
+        state: Some(vec![i as f32 * 0.1; STATE]),
+        action: Some(vec![0.3, -0.1 * i as f32]),
+        reward: Some(0.2),
+        noise: 0.0,
+    };
     let history: Vec<Vec<Token>> = (0..BATCH).map(|b| (0..3).map(|i| token(b + i)).collect()).collect();
     let tensor = |values| Tensor::from_vec(values, (BATCH, LEN, DIM), &Device::Cpu).unwrap();
     WindowBatch {
@@ -162,9 +167,10 @@ fn gradients_reach_latents_and_denoiser() {
     let reached = |row| {
         let terms = networks.refine_loss(&config(), &batch(values(1), values(2), row), &options(LatentRouting::Matched)).unwrap();
         let grads = terms.loss.backward().unwrap();
-        let reached = params.vars().into_iter().filter(|(_, var)| {
-            grads.get(var).is_some_and(|grad| grad.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap() > 0.0)
-        });
+        let reached = params
+            .vars()
+            .into_iter()
+            .filter(|(_, var)| grads.get(var).is_some_and(|grad| grad.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap() > 0.0));
         reached.map(|(name, _)| name).collect::<Vec<_>>()
     };
     // The output layer starts at zero, so at first only it and the input skip move; the skip sees the latents.

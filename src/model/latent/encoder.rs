@@ -57,10 +57,7 @@ impl Encoder {
             state: Part::new(layout.state_dim, STATE_WIDTH, &params.scope("state"))?,
             action: Part::new(layout.action_dim, ACTION_WIDTH, &params.scope("action"))?,
             reward: Part::new(1, REWARD_WIDTH, &params.scope("reward"))?,
-            mlp: [
-                Linear::new(width, TOKEN_WIDTH, &params.scope("mlp.0"))?,
-                Linear::new(TOKEN_WIDTH, TOKEN_WIDTH, &params.scope("mlp.2"))?,
-            ],
+            mlp: [Linear::new(width, TOKEN_WIDTH, &params.scope("mlp.0"))?, Linear::new(TOKEN_WIDTH, TOKEN_WIDTH, &params.scope("mlp.2"))?],
             gru: Gru::new(TOKEN_WIDTH, config.hidden, &params.scope("gru"))?,
             mean: Linear::new(config.hidden, config.dim, &params.scope("mean"))?,
             log_var: Linear::new(config.hidden, config.dim, &params.scope("log_var"))?,

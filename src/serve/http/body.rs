@@ -43,8 +43,9 @@ pub fn parse<T: DeserializeOwned>(bytes: &[u8], part: Part, config: &Config) -> 
     let mut json = serde_json::Deserializer::from_slice(bytes);
     let value = serde_path_to_error::deserialize(&mut json).map_err(|error| {
         let path = error.path().to_string();
-        let field = if path == "." { "body".to_owned() } else { path };
-        ServiceError::invalid(part, field, error.inner().to_string())
+        // "?" stands for a place that has no name yet.
+        let field = path.trim_end_matches(['.', '?']);
+        ServiceError::invalid(part, if field.is_empty() { "body" } else { field }, error.inner().to_string())
     })?;
     json.end().map_err(|error| ServiceError::invalid(part, "body", error.to_string()))?;
     Ok(value)

@@ -1,4 +1,4 @@
-//! ActStream as a WebSocket: text messages in, text messages out.
+//! ActStream as a WebSocket: text messages in, text messages out. The client's close, or its disappearance, drops the acts that are not answered yet.
 
 use super::{
     Gate, State,
@@ -11,14 +11,20 @@ use crate::serve::{
     service::Service,
 };
 use axum::extract::ws::{CloseFrame, Message, WebSocket, close_code};
-use futures_util::{SinkExt, Stream, StreamExt, future};
-use std::{pin::pin, sync::Arc};
+use futures_util::{SinkExt, Stream, StreamExt, future, stream};
+use std::{pin::pin, sync::Arc, task::Poll};
+use tokio_util::sync::CancellationToken;
 
 /// Serves one socket until its client leaves, or the server drains and the last act is answered.
 pub async fn serve(socket: WebSocket, state: State, session_id: String, gate: Gate) {
     let (mut answers, messages) = socket.split();
-    let results = state.service.clone().act_stream(acts(messages, state.service.clone(), session_id));
-    let mut results = pin!(results);
+    let left = CancellationToken::new();
+    let leave = left.clone();
+    let acts = acts(messages, state.service.clone(), session_id).chain(stream::poll_fn(move |_| {
+        leave.cancel();
+        Poll::Ready(None)
+    }));
+    let mut results = pin!(state.service.clone().act_stream(acts).take_until(left.cancelled()));
     let talk = async {
         while let Some(result) = results.next().await {
             let text = serde_json::to_string(&ResultAnswer::from(result)).expect("an answer is plain data, or it is a bug");
@@ -26,14 +32,15 @@ pub async fn serve(socket: WebSocket, state: State, session_id: String, gate: Ga
                 return;
             }
         }
-        let (code, reason) = if state.service.draining().is_cancelled() { (close_code::AWAY, "draining") } else { (close_code::NORMAL, "") };
+        let (code, reason) =
+            if state.service.draining().is_cancelled() { (close_code::AWAY, "draining") } else { (close_code::NORMAL, "") };
         // The client may be gone already; then there is nobody to tell.
         let _gone = answers.send(Message::Close(Some(CloseFrame { code, reason: reason.into() }))).await;
     };
     gate.until_hard_end(talk).await;
 }
 
-/// The acts among the messages; the stream ends with the client's close or a broken connection.
+/// The acts among the messages; they end with the client's close or a broken connection.
 fn acts(
     messages: impl Stream<Item = Result<Message, axum::Error>>,
     service: Arc<Service>,

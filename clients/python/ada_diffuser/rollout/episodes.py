@@ -68,7 +68,7 @@ class _Lane:
         """Executes the next action of the chunk and reports its reward."""
         action = self.broker.take(self.state)
         observation, reward, terminated, truncated, facts = self.env.step(action)
-        self.broker.record(reward=float(reward))
+        self.broker.report(reward=float(reward))
         self.episode.states.append(self.state)
         self.episode.actions.append(action)
         self.episode.rewards.append(float(reward))

@@ -10,7 +10,7 @@ from ada_diffuser.rollout.result import Evaluation
 
 def table(result: Evaluation, readout: Readout | str) -> str:
     """What the demo ends with."""
-    options = ", ".join(f"{name}={value}" for name, value in result.options.given().items())
+    options = ", ".join(f"{name}={_setting(value)}" for name, value in result.options.given().items())
     call = "batch" if result.trial.vector > 1 else "act"
     rows = [
         ("environment", result.trial.env),

@@ -1,0 +1,43 @@
+//! Sampling defaults of a finished checkpoint: they are chosen on validation episodes, after training.
+
+use super::flags::Defaults;
+use crate::model::{
+    agent::Agent,
+    checkpoint::{copy_with, load},
+    config::ModelConfig,
+};
+use anyhow::{Context, Result, bail};
+use serde_json::Value;
+
+/// Copies the checkpoint with the given keys of `sampler` and `restart` changed.
+///
+/// # Errors
+/// If the checkpoint is refused, or a key or value is none of the model's.
+pub fn defaults(flags: &Defaults) -> Result<()> {
+    let agent = load(&flags.checkpoint)?;
+    let mut config = serde_json::to_value(agent.config())?;
+    flags.overrides.iter().try_for_each(|text| set(&mut config, text))?;
+    let config: ModelConfig = serde_json::from_value(config)?;
+    check(&agent, &config)?;
+    Ok(copy_with(&flags.checkpoint, &flags.out, &config)?)
+}
+
+/// `sampler.kappa=0.1`; infinity is `inf`.
+fn set(config: &mut Value, text: &str) -> Result<()> {
+    let (key, value) = text.split_once('=').with_context(|| format!("--set {text}: expected KEY=VALUE"))?;
+    let (section, name) = key.split_once('.').unwrap_or((key, ""));
+    if !["sampler", "restart"].contains(&section) {
+        bail!("--set {text}: only keys of sampler and restart can be changed after training");
+    }
+    let entry = config[section].get_mut(name).with_context(|| format!("--set {text}: {section} has no {name}"))?;
+    *entry = match value {
+        "inf" | "infinity" => Value::Null,
+        _ => serde_json::from_str(value).unwrap_or_else(|_| Value::String(value.into())),
+    };
+    Ok(())
+}
+
+/// The new defaults must be options that a session could ask for.
+fn check(agent: &Agent, config: &ModelConfig) -> Result<()> {
+    agent.open(0, &config.sampler).map(|_| ()).context("sampler")
+}

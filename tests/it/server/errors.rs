@@ -1,0 +1,249 @@
+//! Every row of the error table that a client can bring about, on both faces. (The rest, row by row, stands in the unit tests of the two tables.)
+
+use super::*;
+
+/// The same failure on both faces; the gRPC side first.
+fn both(grpc: &Status, http: &Reply, expected: (Code, u16, &str)) {
+    assert_eq!((failure(grpc), (http.status, http.reason().as_str())), ((expected.0, expected.2.into()), (expected.1, expected.2)), "{grpc:?}");
+}
+
+/// The same act on both faces, both refused.
+async fn refused(server: &Running, id: &str, step: u64, state: &[f32], expected: (Code, u16, &str)) -> (Status, Reply) {
+    let grpc = server.agent().await.act(act(id, step, state)).await.unwrap_err();
+    let http = server.act(id, step, state).await;
+    both(&grpc, &http, expected);
+    (grpc, http)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn steps() {
+    let server = start(|_| {}).await;
+    let id = server.open(json!({})).await;
+    for step in [0, 2, 3, u64::MAX] {
+        let (grpc, http) = refused(&server, &id, step, &STATE, (Code::Aborted, 409, "STEP_OUT_OF_ORDER")).await;
+        assert_eq!((trailer(&grpc, "ada-committed-step").as_deref(), &http.json()["committed_step"]), (Some("0"), &json!(0)));
+    }
+    assert_eq!(server.act(&id, 1, &STATE).await.status, 200);
+    refused(&server, &id, 0, &STATE, (Code::Aborted, 409, "STEP_OUT_OF_ORDER")).await;
+    let (_, http) = refused(&server, &id, 1, &[0.0; 4], (Code::FailedPrecondition, 422, "STEP_PAYLOAD_MISMATCH")).await;
+    assert_eq!(http.json()["committed_step"], 1);
+    assert_eq!(server.act(&id, 2, &STATE).await.status, 200, "nothing is lost");
+    let slow = server.open(json!({"model": "slow"})).await;
+    let blocker = server.start_slow(&slow).await;
+    refused(&server, &slow, 2, &STATE, (Code::Aborted, 409, "SESSION_BUSY")).await;
+    refused(&server, &slow, 1, &[0.0; 4], (Code::FailedPrecondition, 422, "STEP_PAYLOAD_MISMATCH")).await;
+    blocker.abort();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn unknown_sessions_and_models() {
+    let server = start(|_| {}).await;
+    for id in ["7b1f2c5e-3c55-4a3e-9c33-0f3f6f9d8a11", "junk"] {
+        refused(&server, id, 1, &STATE, (Code::NotFound, 404, "SESSION_NOT_FOUND")).await;
+        let grpc = server.agent().await.get_session(pb::GetSessionRequest { session_id: id.into() }).await.unwrap_err();
+        both(&grpc, &server.get(&format!("/v1/sessions/{id}")).await, (Code::NotFound, 404, "SESSION_NOT_FOUND"));
+        let grpc = server.agent().await.close_session(pb::CloseSessionRequest { session_id: id.into() }).await.unwrap_err();
+        both(&grpc, &server.http("DELETE", &format!("/v1/sessions/{id}"), "").await, (Code::NotFound, 404, "SESSION_NOT_FOUND"));
+    }
+    let grpc = server.agent().await.open_session(pb::OpenSessionRequest { model: "x".into(), ..Default::default() }).await.unwrap_err();
+    both(&grpc, &server.post("/v1/sessions", &json!({"model": "x"})).await, (Code::NotFound, 404, "MODEL_NOT_FOUND"));
+    let grpc = server.models().await.get(pb::GetModelRequest { model: "x".into() }).await.unwrap_err();
+    both(&grpc, &server.get("/v1/models/x").await, (Code::NotFound, 404, "MODEL_NOT_FOUND"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn expired_and_evicted_sessions() {
+    let server = start(|config| {
+        config.sessions.len_max = 2;
+        config.sessions.evict_idle_ms = 0;
+    })
+    .await;
+    let short = server.open(json!({"ttl_ms": 1})).await;
+    tokio::time::sleep(Duration::from_millis(20)).await;
+    refused(&server, &short, 1, &STATE, (Code::NotFound, 410, "SESSION_EXPIRED")).await;
+    let slow = server.open(json!({"model": "slow"})).await;
+    let blocker = server.start_slow(&slow).await;
+    let idle = server.open(json!({})).await;
+    let newer = server.open(json!({})).await;
+    refused(&server, &idle, 1, &STATE, (Code::NotFound, 410, "SESSION_EVICTED")).await;
+    assert_eq!(server.get(&format!("/v1/sessions/{slow}")).await.json()["session"]["busy"], true, "the one in flight is never evicted");
+    assert_eq!(server.act(&newer, 1, &STATE).await.status, 200);
+    blocker.abort();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_room_for_a_session() {
+    let server = start(|config| config.sessions.len_max = 1).await;
+    let id = server.open(json!({})).await;
+    let grpc = server.agent().await.open_session(pb::OpenSessionRequest::default()).await.unwrap_err();
+    let http = server.post("/v1/sessions", &json!({})).await;
+    both(&grpc, &http, (Code::ResourceExhausted, 429, "QUOTA"));
+    assert!(trailer(&grpc, "grpc-retry-pushback-ms").is_some() && http.headers.contains_key("retry-after"));
+    assert_eq!(server.http("DELETE", &format!("/v1/sessions/{id}"), "").await.status, 204);
+    server.open(json!({})).await;
+    let small = start(|config| config.sessions.bytes_max = 1).await;
+    assert_eq!(small.post("/v1/sessions", &json!({})).await.reason(), "QUOTA", "the bound on memory");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn observations_that_do_not_fit() {
+    let server = start(|_| {}).await;
+    let id = server.open(json!({})).await;
+    for state in [&[][..], &[0.0; 3], &[0.0; 5]] {
+        let (grpc, http) = refused(&server, &id, 1, state, (Code::InvalidArgument, 400, "OBSERVATION_INVALID")).await;
+        assert_eq!((trailer(&grpc, "ada-field").as_deref(), &http.json()["field"]), (Some("observation.state"), &json!("observation.state")));
+    }
+    for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let grpc = server.agent().await.act(act(&id, 1, &[0.0, value, 0.0, 0.0])).await.unwrap_err();
+        assert_eq!(failure(&grpc), (Code::InvalidArgument, "OBSERVATION_INVALID".into()));
+        assert_eq!(trailer(&grpc, "ada-field").as_deref(), Some("observation.state[1]"));
+    }
+    let with = |executed: pb::Executed| {
+        let observation = pb::Observation { state: STATE.to_vec(), executed: vec![executed] };
+        pb::ActRequest { observation: Some(observation), ..act(&id, 1, &STATE) }
+    };
+    let vector = |values: &[f32]| Some(pb::Vector { values: values.to_vec() });
+    for executed in [
+        pb::Executed { action: vector(&[0.0]), ..Default::default() },
+        pb::Executed { state: vector(&[0.0]), ..Default::default() },
+        pb::Executed { action: vector(&[0.0, f32::NAN]), ..Default::default() },
+        pb::Executed { reward: Some(f32::NAN), ..Default::default() },
+    ] {
+        let grpc = server.agent().await.act(with(executed)).await.unwrap_err();
+        assert_eq!(failure(&grpc), (Code::InvalidArgument, "OBSERVATION_INVALID".into()));
+        assert!(trailer(&grpc, "ada-field").unwrap().starts_with("observation.executed[0]."), "{grpc:?}");
+    }
+    assert_eq!(server.act(&id, 1, &STATE).await.status, 200, "nothing is lost");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn json_that_does_not_fit() {
+    let server = start(|config| config.limits.json_depth_max = 8).await;
+    let id = server.open(json!({})).await;
+    let deep = format!(r#"{{"step":1,"observation":{{"state":{}1{}}}}}"#, "[".repeat(9), "]".repeat(9));
+    for (body, field) in [
+        ("", "body"),
+        ("{", "body"),
+        ("[]", "body"),
+        ("null", "body"),
+        (r#"{"step":1}"#, "body"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0]}} x"#, "body"),
+        (r#"{"step":-1,"observation":{"state":[0,0,0,0]}}"#, "step"),
+        (r#"{"step":1.5,"observation":{"state":[0,0,0,0]}}"#, "step"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,"NaN"]}}"#, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,null]}}"#, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,1e999]}}"#, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,1e39]}}"#, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,NaN]}}"#, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0],"goal":1}}"#, "observation.goal"),
+        (r#"{"step":1,"step":1,"observation":{"state":[0,0,0,0]}}"#, "step"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0],"executed":[{"actions":[0,0]}]}}"#, "observation.executed[0].actions"),
+        (deep.as_str(), "body"),
+    ] {
+        let reply = server.http("POST", &format!("/v1/sessions/{id}/act"), body).await;
+        assert_eq!((reply.status, reply.reason().as_str()), (400, "OBSERVATION_INVALID"), "{body}");
+        assert_eq!(reply.json()["field"], field, "{body}: {}", reply.text);
+    }
+    let reply = server.http("POST", &format!("/v1/sessions/{id}/act"), r#"{"session_id":"x","step":1,"observation":{"state":[]}}"#).await;
+    assert_eq!((reply.status, reply.json()["field"].as_str().unwrap()), (400, "session_id"));
+    for (path, body) in [("/v1/sessions", r#"{"sed":1}"#), ("/v1/sessions", ""), (&format!("/v1/sessions/{id}/reset"), r#"{"seed":-1}"#)] {
+        let reply = server.http("POST", path, body).await;
+        assert_eq!((reply.status, reply.reason().as_str()), (400, "REQUEST_INVALID"), "{path} {body}");
+    }
+    assert_eq!(server.act(&id, 1, &STATE).await.status, 200, "nothing is lost");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn requests_and_options_that_do_not_fit() {
+    let server = start(|_| {}).await;
+    let options = |options: pb::SamplerOptions| pb::OpenSessionRequest { options: Some(options), ..Default::default() };
+    let none = pb::SamplerOptions::default();
+    for (grpc, http, field) in [
+        (pb::SamplerOptions { action_horizon: Some(0), ..none }, json!({"action_horizon": 0}), "options.action_horizon"),
+        (pb::SamplerOptions { action_horizon: Some(9), ..none }, json!({"action_horizon": 9}), "options.action_horizon"),
+        (pb::SamplerOptions { sub_steps: Some(0), ..none }, json!({"sub_steps": 0}), "options.sub_steps"),
+        (pb::SamplerOptions { eta: Some(2.0), ..none }, json!({"eta": 2}), "options.eta"),
+        (pb::SamplerOptions { kappa: Some(-1.0), ..none }, json!({"kappa": -1}), "options.kappa"),
+    ] {
+        let grpc = server.agent().await.open_session(options(grpc)).await.unwrap_err();
+        let http = server.post("/v1/sessions", &json!({"options": http})).await;
+        both(&grpc, &http, (Code::InvalidArgument, 400, "OPTIONS_INVALID"));
+        assert_eq!((trailer(&grpc, "ada-field").as_deref(), http.json()["field"].as_str()), (Some(field), Some(field)));
+    }
+    let grpc = server.agent().await.open_session(options(pb::SamplerOptions { latent: Some(9), ..none })).await.unwrap_err();
+    assert_eq!(failure(&grpc), (Code::InvalidArgument, "OPTIONS_INVALID".into()));
+    for ttl_ms in [0, u64::MAX] {
+        let grpc = server.agent().await.open_session(pb::OpenSessionRequest { ttl_ms: Some(ttl_ms), ..Default::default() }).await.unwrap_err();
+        let http = server.post("/v1/sessions", &json!({"ttl_ms": ttl_ms})).await;
+        both(&grpc, &http, (Code::InvalidArgument, 400, "REQUEST_INVALID"));
+    }
+    let token = pb::ListSessionsRequest { page_token: "x".into(), ..Default::default() };
+    let grpc = server.agent().await.list_sessions(token).await.unwrap_err();
+    both(&grpc, &server.get("/v1/sessions?page_token=x").await, (Code::InvalidArgument, 400, "REQUEST_INVALID"));
+    assert_eq!(server.get("/v1/sessions?page=1").await.reason(), "REQUEST_INVALID");
+    assert_eq!(server.get("/v1/nothing").await.status, 404);
+    assert_eq!(server.get("/v1/act:batch").await.reason(), "METHOD_NOT_ALLOWED");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn messages_that_are_too_large_or_none() {
+    let server = start(|config| {
+        config.limits.message_bytes_max = 2048;
+        config.limits.act_batch_len_max = 2;
+    })
+    .await;
+    let id = server.open(json!({})).await;
+    refused(&server, &id, 1, &[0.123_456_7; 1000], (Code::ResourceExhausted, 413, "TOO_LARGE")).await;
+    let body = json!({"acts": vec![json!({"session_id": id, "step": 1, "observation": {"state": STATE}}); 3]});
+    let grpc = server.agent().await.act_batch(pb::ActBatchRequest { acts: vec![act(&id, 1, &STATE); 3] }).await.unwrap_err();
+    both(&grpc, &server.post("/v1/act:batch", &body).await, (Code::ResourceExhausted, 413, "TOO_LARGE"));
+    let path = format!("/v1/sessions/{id}/act");
+    let fits = r#"{"step":1,"observation":{"state":[0,0,0,0]}}"#;
+    assert_eq!(server.http("POST", &path, &format!("{fits:2049}")).await.reason(), "TOO_LARGE", "one byte too many");
+    assert_eq!(server.http("POST", &path, &format!("{fits:2048}")).await.status, 200, "as many as may be");
+    let mut raw = tonic::client::Grpc::new(server.channel().await);
+    raw.ready().await.unwrap();
+    let codec = tonic_prost::ProstCodec::<pb::Vector, pb::ActResponse>::default();
+    let path = "/ada_diffuser.v1.Agent/Act".parse().unwrap();
+    let malformed = raw.unary(tonic::Request::new(pb::Vector { values: vec![1.0; 3] }), path, codec).await.unwrap_err();
+    assert_eq!(failure(&malformed), (Code::InvalidArgument, "REQUEST_INVALID".into()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_full_queue_and_passed_deadlines() {
+    let (_process, server) = start_process(&["engine.workers=1", "engine.queue_len_max=1"]).await;
+    let (running, waiting, third) =
+        (server.open(json!({"model": "slow"})).await, server.open(json!({})).await, server.open(json!({})).await);
+    let hasty = |id: &str, ms| pb::ActRequest { deadline_ms: Some(ms), ..act(id, 1, &STATE) };
+    let hasty_http = |ms: u32| json!({"step": 1, "observation": {"state": STATE}, "deadline_ms": ms});
+    for (ms, reason) in [(0, "DEADLINE_ADMISSION"), (50, "DEADLINE_COMPUTE")] {
+        let grpc = server.agent().await.act(hasty(&running, ms)).await.unwrap_err();
+        let http = server.post(&format!("/v1/sessions/{running}/act"), &hasty_http(ms)).await;
+        both(&grpc, &http, (Code::DeadlineExceeded, 504, reason));
+    }
+    let blocker = server.start_slow(&running).await;
+    while server.metric("ada_inflight_acts").await < 1.0 {}
+    let grpc = server.agent().await.act(hasty(&waiting, 50)).await.unwrap_err();
+    let http = server.post(&format!("/v1/sessions/{waiting}/act"), &hasty_http(50)).await;
+    both(&grpc, &http, (Code::DeadlineExceeded, 504, "DEADLINE_QUEUE"));
+    let queued = server.start_slow(&waiting).await;
+    let (grpc, http) = refused(&server, &third, 1, &STATE, (Code::ResourceExhausted, 429, "QUEUE_FULL")).await;
+    assert!(trailer(&grpc, "grpc-retry-pushback-ms").is_some() && http.headers.contains_key("retry-after"));
+    blocker.abort();
+    assert_eq!(queued.await.unwrap().unwrap().step, 1, "the next one has the worker at once");
+    assert_eq!(server.act(&third, 1, &STATE).await.status, 200, "nothing is lost");
+    let mut request = tonic::Request::new(act(&running, 1, &STATE));
+    request.metadata_mut().insert("grpc-timeout", "50m".parse().unwrap());
+    let late = server.agent().await.act(request).await.unwrap_err();
+    assert_eq!(late.code(), Code::DeadlineExceeded, "the call's own timeout counts: {late:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_output_that_is_not_finite() {
+    let server = start(|_| {}).await;
+    let (bad, good) = (server.open(json!({"model": "exploding"})).await, server.open(json!({})).await);
+    let (grpc, http) = refused(&server, &bad, 1, &STATE, (Code::Internal, 500, "NONFINITE_OUTPUT")).await;
+    assert!(trailer(&grpc, "ada-error-id").is_some() && http.json()["error_id"].is_string());
+    assert_eq!(server.get(&format!("/v1/sessions/{bad}")).await.json()["session"]["committed_step"], 0);
+    assert_eq!(server.act(&good, 1, &STATE).await.status, 200);
+}

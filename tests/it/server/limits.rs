@@ -1,0 +1,120 @@
+//! Bounds of connections, and that the I/O threads stay free while the engine works.
+
+use super::*;
+use std::time::Instant;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+async fn answer_of(stream: &mut TcpStream) -> String {
+    let mut text = Vec::new();
+    let _reset_counts_as_end = timeout(Duration::from_secs(5), stream.read_to_end(&mut text)).await.expect("the server keeps the connection");
+    String::from_utf8_lossy(&text).into_owned()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn silent_and_slow_connections_are_closed() {
+    let server = start(|config| {
+        config.connection.preface_timeout_ms = 200;
+        config.connection.header_read_timeout_ms = 300;
+        config.connection.body_read_timeout_ms = 200;
+    })
+    .await;
+    for said in ["", "PRI", "PRI * HTTP/2.0\r\n\r\nSM\r\n\r", "GET /readyz HTTP/1.1\r\nhost: x\r\nslow"] {
+        let mut stream = TcpStream::connect(server.address).await.unwrap();
+        stream.write_all(said.as_bytes()).await.unwrap();
+        let begin = Instant::now();
+        answer_of(&mut stream).await;
+        assert!(begin.elapsed() < Duration::from_secs(2), "{said:?} took {:?}", begin.elapsed());
+    }
+    let mut stream = TcpStream::connect(server.address).await.unwrap();
+    stream.write_all(b"POST /v1/sessions HTTP/1.1\r\nhost: x\r\ncontent-length: 9\r\n\r\n{").await.unwrap();
+    assert!(answer_of(&mut stream).await.starts_with("HTTP/1.1 504"), "a body that does not come");
+    assert!(server.metric("ada_connections_timed_out_total").await >= 3.0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn one_connection_too_many_is_turned_away() {
+    let server = start(|config| config.server.connections_max = 2).await;
+    let mut held = [TcpStream::connect(server.address).await.unwrap(), TcpStream::connect(server.address).await.unwrap()];
+    for stream in &mut held {
+        stream.write_all(b"GET ").await.unwrap();
+    }
+    let mut third = TcpStream::connect(server.address).await.unwrap();
+    assert!(answer_of(&mut third).await.starts_with("HTTP/1.1 503"));
+    drop(held);
+    let until_free = async {
+        loop {
+            let mut stream = TcpStream::connect(server.address).await.unwrap();
+            stream.write_all(b"GET /readyz HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n").await.unwrap();
+            if answer_of(&mut stream).await.starts_with("HTTP/1.1 200") {
+                break;
+            }
+        }
+    };
+    timeout(Duration::from_secs(5), until_free).await.expect("the places were not given back");
+}
+
+/// The number of headers and their bytes are bounded.
+#[tokio::test(flavor = "multi_thread")]
+async fn headers_are_bounded() {
+    let server = start(|_| {}).await;
+    for (count, len) in [(100, 1), (1, 40_000)] {
+        let headers: String = (0..count).map(|i| format!("x-{i}: {}\r\n", "y".repeat(len))).collect();
+        let mut stream = TcpStream::connect(server.address).await.unwrap();
+        let request = format!("GET /readyz HTTP/1.1\r\nhost: x\r\n{headers}\r\n");
+        // The server may answer and close before it has read everything.
+        let _closed_early = stream.write_all(request.as_bytes()).await;
+        assert!(!answer_of(&mut stream).await.starts_with("HTTP/1.1 200"), "{count} headers of {len}");
+    }
+    assert_eq!(server.get("/readyz").await.status, 200);
+}
+
+/// A client that cancels a lot is honest: its connection lives on.
+#[tokio::test(flavor = "multi_thread")]
+async fn many_cancels_do_not_cost_the_connection() {
+    let server = start(|_| {}).await;
+    let slow = server.open(json!({"model": "slow"})).await;
+    let id = server.open(json!({})).await;
+    let mut agent = server.agent().await;
+    for _ in 0..300 {
+        let _cut = timeout(Duration::from_millis(1), agent.act(act(&slow, 1, &STATE))).await;
+    }
+    assert_eq!(agent.act(act(&id, 1, &STATE)).await.unwrap().into_inner().step, 1);
+}
+
+/// R7: while both workers are busy for minutes, everybody else is answered at once.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_io_threads_stay_free() {
+    let server = start(|_| {}).await;
+    let mut busy = Vec::new();
+    for _ in 0..4 {
+        let slow = server.open(json!({"model": "slow"})).await;
+        busy.push(server.start_slow(&slow).await);
+    }
+    let mut worst = Duration::ZERO;
+    for _ in 0..50 {
+        let begin = Instant::now();
+        assert_eq!(server.get("/livez").await.status, 200);
+        worst = worst.max(begin.elapsed());
+    }
+    assert!(worst < Duration::from_millis(500), "{worst:?}");
+    assert!(busy.iter().all(|task| !task.is_finished()));
+}
+
+/// Every metric is in the catalogue, and acts are conserved.
+#[tokio::test(flavor = "multi_thread")]
+async fn metrics_are_documented() {
+    let server = start(|_| {}).await;
+    let id = server.open(json!({})).await;
+    assert_eq!(server.act(&id, 1, &STATE).await.status, 200);
+    let text = server.get("/metrics").await.text;
+    let catalogue = ada_diffuser::serve::telemetry::CATALOGUE.map(|(name, ..)| name);
+    let mut seen = 0;
+    for line in text.lines().filter(|line| line.starts_with("# TYPE ")) {
+        let name = line.split(' ').nth(2).unwrap();
+        assert!(catalogue.contains(&name), "{name} is not in the catalogue");
+        seen += 1;
+    }
+    assert!(seen >= 15, "{text}");
+    assert!(text.contains("# HELP ada_acts_total") && text.contains(r#"face="http""#));
+    assert!(!text.contains(&id), "no session id is ever a label");
+}
