@@ -80,3 +80,36 @@ fn transitions(episodes: &[Episode], places: &[Place]) -> (Table, Table) {
     }
     (features, truth)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{noise::Philox, trajectory::Layout};
+
+    /// s' = s / 2 + a + c with a context c drawn anew at each step: a transition tells all of it, the past nothing.
+    fn episodes(count: usize, seed: u64) -> Vec<Episode> {
+        let mut rng = Philox::new(seed);
+        let mut episode = || {
+            let mut noise = || (0..40).map(|_| rng.normal()).collect::<Vec<f32>>();
+            let (actions, context, rewards) = (noise(), noise(), vec![0.0; 40]);
+            let mut states = vec![0.0];
+            for t in 0..39 {
+                states.push(0.5 * states[t] + actions[t] + context[t]);
+            }
+            Episode { layout: Layout { state_dim: 1, action_dim: 1 }, context_dim: 1, states, actions, rewards, context }
+        };
+        (0..count).map(|_| episode()).collect()
+    }
+
+    #[test]
+    fn knows_what_a_transition_tells_and_no_more() {
+        let (train, held_out) = (episodes(40, 1), episodes(10, 2));
+        let subjects = Subjects { train: &train, held_out: &held_out, rows_max: 5000 };
+        for score in ceiling(&subjects, &[1, 3]).unwrap() {
+            match score.evidence {
+                Evidence::Filter => assert!(score.error > 0.9, "{score:?}"),
+                Evidence::SuccessorState | Evidence::Successor => assert!(score.error < 0.01, "{score:?}"),
+            }
+        }
+    }
+}

@@ -165,14 +165,15 @@ impl InplaceOp1 for Step<'_> {
         };
         let [first, second] = &mut *self.moments.borrow_mut();
         let keep = (1.0 - self.rate * self.weight_decay) as f32;
-        let (b1, b2) = (BETA.0 as f32, BETA.1 as f32);
+        // Complements in f64: 1 - .999 in f32 is off by 5e-5 of itself.
+        let (b1, b2) = ((BETA.0 as f32, (1.0 - BETA.0) as f32), (BETA.1 as f32, (1.0 - BETA.1) as f32));
         let rate = (self.rate / self.correction.0) as f32;
         let (root, epsilon) = ((1.0 / self.correction.1.sqrt()) as f32, EPSILON as f32);
         let moments = first.iter_mut().zip(second.iter_mut());
         for ((value, grad), (m, v)) in values[from..to].iter_mut().zip(self.grad).zip(moments) {
             let grad = grad * self.scale;
-            *m = b1 * *m + (1.0 - b1) * grad;
-            *v = b2 * *v + (1.0 - b2) * grad * grad;
+            *m = b1.0 * *m + b1.1 * grad;
+            *v = b2.0 * *v + b2.1 * grad * grad;
             *value = keep * *value - rate * *m / (v.sqrt() * root + epsilon);
         }
         Ok(())
