@@ -152,7 +152,13 @@ pub enum LogFormat {
 
 impl Default for ServerConfig {
     fn default() -> Self {
-        Self { listen: SocketAddr::from(([127, 0, 0, 1], 7777)), io_threads: 0, connections_max: 4096, drain_notice_ms: 250, drain_timeout_ms: 10_000 }
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 7777)),
+            io_threads: 0,
+            connections_max: 4096,
+            drain_notice_ms: 250,
+            drain_timeout_ms: 10_000,
+        }
     }
 }
 

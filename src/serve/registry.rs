@@ -91,9 +91,8 @@ impl Registry {
             None => (reference, None),
         };
         let name = if name.is_empty() { &*self.default } else { name };
-        let is_meant = |model: &&Model| {
-            digest.is_none_or(|digest| digest.len() >= DIGEST_PREFIX_MIN && model.agent.spec().digest.starts_with(digest))
-        };
+        let is_meant =
+            |model: &&Model| digest.is_none_or(|digest| digest.len() >= DIGEST_PREFIX_MIN && model.agent.spec().digest.starts_with(digest));
         let shown = || ServiceError::ModelNotFound { model: reference.chars().take(2 * NAME_LEN_MAX).collect() };
         self.models.get(name).filter(is_meant).ok_or_else(shown)
     }

@@ -30,9 +30,11 @@ fn latent_mode(mode: i32) -> Checked<LatentMode> {
     match pb::LatentMode::try_from(mode) {
         Ok(pb::LatentMode::Mean) => Ok(LatentMode::Mean),
         Ok(pb::LatentMode::Sample) => Ok(LatentMode::Sample),
-        Ok(pb::LatentMode::Unspecified) | Err(_) => {
-            Err(ServiceError::invalid(Part::Options, "options.latent", format!("{mode} is neither LATENT_MODE_MEAN nor LATENT_MODE_SAMPLE")))
-        }
+        Ok(pb::LatentMode::Unspecified) | Err(_) => Err(ServiceError::invalid(
+            Part::Options,
+            "options.latent",
+            format!("{mode} is neither LATENT_MODE_MEAN nor LATENT_MODE_SAMPLE"),
+        )),
     }
 }
 
@@ -173,19 +175,8 @@ fn sampler_options(options: &SamplerOptions) -> pb::SamplerOptions {
 
 pub fn model(model: &Model) -> pb::Model {
     let Model { name, agent, is_default } = model;
-    let Spec {
-        layout,
-        plan_horizon,
-        block_len,
-        obs_horizon,
-        latent_dim,
-        level_max,
-        action_low,
-        action_high,
-        sampler,
-        refined,
-        digest,
-    } = agent.spec();
+    let Spec { layout, plan_horizon, block_len, obs_horizon, latent_dim, level_max, action_low, action_high, sampler, refined, digest } =
+        agent.spec();
     pb::Model {
         name: name.to_string(),
         digest: digest.clone(),

@@ -299,7 +299,8 @@ pub struct SessionAnswer {
 
 impl From<Summary> for SessionAnswer {
     fn from(summary: Summary) -> Self {
-        let Summary { id, model, model_digest, seed, committed_step, episode, options, latent, age, idle, ttl, state_bytes, busy } = summary;
+        let Summary { id, model, model_digest, seed, committed_step, episode, options, latent, age, idle, ttl, state_bytes, busy } =
+            summary;
         let (latent_mean, latent_log_var) = latent.unwrap_or_default();
         let ms = |time: Duration| time.as_millis() as u64;
         Self {

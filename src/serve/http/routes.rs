@@ -4,7 +4,8 @@ use super::{
     Gate, State,
     body::{bytes, parse},
     json::{
-        ActAnswer, ActBody, BatchAnswer, BatchBody, ListQuery, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer, OpenBody, ResetBody,
+        ActAnswer, ActBody, BatchAnswer, BatchBody, ListQuery, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer, OpenBody,
+        ResetBody,
     },
     problem::Problem,
     stream,
@@ -16,7 +17,10 @@ use crate::serve::{
 use axum::{
     Extension, Json, Router,
     body::Body,
-    extract::{MatchedPath, Path, Query, Request, State as Shared, WebSocketUpgrade, rejection::QueryRejection, ws::rejection::WebSocketUpgradeRejection},
+    extract::{
+        MatchedPath, Path, Query, Request, State as Shared, WebSocketUpgrade, rejection::QueryRejection,
+        ws::rejection::WebSocketUpgradeRejection,
+    },
     http::StatusCode,
     middleware::{self, Next},
     response::{IntoResponse, Response},
@@ -29,7 +33,10 @@ use utoipa_axum::{router::OpenApiRouter, routes};
 type Answer<T> = Result<Json<T>, Problem>;
 
 #[derive(OpenApi)]
-#[openapi(info(title = "Ada-Diffuser", description = "The verbs of an episode; see clients/http/README.md. Errors are application/problem+json."))]
+#[openapi(info(
+    title = "Ada-Diffuser",
+    description = "The verbs of an episode; see clients/http/README.md. Errors are application/problem+json."
+))]
 struct Api;
 
 fn documented() -> OpenApiRouter<State> {

@@ -32,7 +32,8 @@ pub async fn serve(socket: WebSocket, state: State, session_id: String, gate: Ga
                 return;
             }
         }
-        let (code, reason) = if state.service.draining().is_cancelled() { (close_code::AWAY, "draining") } else { (close_code::NORMAL, "") };
+        let (code, reason) =
+            if state.service.draining().is_cancelled() { (close_code::AWAY, "draining") } else { (close_code::NORMAL, "") };
         // The client may be gone already; then there is nobody to tell.
         let _gone = answers.send(Message::Close(Some(CloseFrame { code, reason: reason.into() }))).await;
     };

@@ -130,7 +130,8 @@ impl Sessions {
 
     /// Up to `len` sessions with ids above `after`, in order of id.
     pub fn page(&self, after: Option<Uuid>, model: Option<&str>, len: usize) -> Vec<Arc<Session>> {
-        let wanted = |session: &&Arc<Session>| after.is_none_or(|after| session.id > after) && model.is_none_or(|model| *session.model == *model);
+        let wanted =
+            |session: &&Arc<Session>| after.is_none_or(|after| session.id > after) && model.is_none_or(|model| *session.model == *model);
         let mut found: Vec<_> = Vec::new();
         for shard in &self.shards {
             found.extend(shard.lock().live.values().filter(wanted).cloned());
