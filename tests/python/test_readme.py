@@ -1,0 +1,60 @@
+"""The README's curl and Python examples, run as they stand against the server and the checkpoints that ship."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ada_diffuser import Client, environments
+
+ROOT = Path(__file__).resolve().parents[2]
+BINARY = Path(os.environ.get("ADA_SERVER", ROOT / "target/release/ada-server"))
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    if not BINARY.exists():
+        pytest.fail(f"no server at {BINARY}: build it with `make build`")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    with (tmp_path_factory.mktemp("server") / "log").open("wb") as log:
+        server = subprocess.Popen([str(BINARY), "--listen", address], cwd=ROOT, stdout=log, stderr=log)
+    try:
+        with Client(f"http://{address}") as client:
+            client.wait_ready(60)
+        yield address
+        server.send_signal(signal.SIGTERM)
+        assert server.wait(30) == 0
+    finally:
+        server.kill()
+        server.wait()
+
+
+def examples(language: str, path: str = "README.md") -> list[str]:
+    blocks = re.findall(rf"```{language}\n(.*?)```", (ROOT / path).read_text(), re.DOTALL)
+    assert blocks, f"no {language} example in {path}"
+    return blocks
+
+
+def test_curl(address: str) -> None:
+    for script in examples("sh"):
+        script = script.replace("localhost:7777", address)
+        answer = subprocess.run(["bash", "-euo", "pipefail", "-c", script], capture_output=True, text=True, timeout=60)
+        assert answer.returncode == 0, answer.stderr
+        for word in ('"actions":', '"latent_mean":', '"evaluations":8', '"step":2', '"cheetah-wind-s"'):
+            assert word in answer.stdout, f"{word} is not in {answer.stdout}"
+
+
+def test_python(address: str) -> None:
+    env = environments.make("cheetah-wind-s")
+    for script in examples("python"):
+        names = {"env": env}
+        exec(script.replace("127.0.0.1:7777", address), names)
+        assert names["done"] is True
