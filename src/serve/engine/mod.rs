@@ -97,7 +97,7 @@ pub struct Engine<T: Ticket> {
 
 /// What workers and callers share.
 struct Shared<T> {
-    queue: Queue<Job<T>>,
+    queue: Queue<Box<Job<T>>>,
     batch_len_max: usize,
     epoch: Instant,
     /// When each worker was last seen, in ms since `epoch`.
@@ -120,8 +120,8 @@ impl<T: Ticket> Engine<T> {
     ///
     /// # Errors
     /// If the queue is full or the engine has ended; the job comes back.
-    pub fn submit(&self, job: Job<T>) -> Result<(), (Refusal, Job<T>)> {
-        self.shared.queue.push(job, |waiting| waiting.ticket.is_wanted())
+    pub fn submit(&self, job: Job<T>) -> Result<(), (Refusal, Box<Job<T>>)> {
+        self.shared.queue.push(Box::new(job), |waiting| waiting.ticket.is_wanted())
     }
 
     /// Acts that wait, and acts in batches.

@@ -22,7 +22,7 @@ fn run<T: Ticket>(shared: &Shared<T>, index: usize) {
         let Some(arrivals) = shared.queue.take(held, ended, shared.batch_len_max.saturating_sub(held)) else { break };
         let before = held + arrivals.len();
         for job in arrivals {
-            batch.admit(job);
+            batch.admit(*job);
         }
         batch.tick();
         ended = before - batch.len();

@@ -1,5 +1,6 @@
 //! The REST face: JSON in, JSON out; the service does the rest.
 
+mod answer;
 mod body;
 mod json;
 mod problem;

@@ -2,11 +2,9 @@
 
 use super::{
     Gate, State,
+    answer::{ActAnswer, BatchAnswer, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer},
     body::{bytes, parse},
-    json::{
-        ActAnswer, ActBody, BatchAnswer, BatchBody, ListQuery, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer, OpenBody,
-        ResetBody,
-    },
+    json::{ActBody, BatchBody, ListQuery, OpenBody, ResetBody},
     problem::Problem,
     stream,
 };

@@ -1,10 +1,6 @@
 //! ActStream as a WebSocket: text messages in, text messages out. The client's close, or its disappearance, drops the acts that are not answered yet.
 
-use super::{
-    Gate, State,
-    body::parse,
-    json::{ActBody, ResultAnswer},
-};
+use super::{Gate, State, answer::ResultAnswer, body::parse, json::ActBody};
 use crate::serve::{
     error::Part,
     request::{ActRequest, ActResult},
