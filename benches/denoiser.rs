@@ -40,6 +40,7 @@ fn config(denoiser: DenoiserConfig) -> ModelConfig {
             reward: Affine::identity(1),
             state_change_std: vec![1.0; STATE],
         },
+        sub_steps_trained: Vec::new(),
         refined: true,
         latent_spread: 1.0,
         restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY },
@@ -112,7 +113,8 @@ fn train_step(c: &mut Criterion) {
         let config = config(net);
         let params = Params::fresh(0);
         let networks = Networks::new(&config, &params).expect("sizes fit");
-        let history = vec![vec![Token { state: Some(vec![0.1; STATE]), action: Some(vec![0.1; ACTION]), reward: Some(0.1), noise: 0.0 }; 10]; 64];
+        let history =
+            vec![vec![Token { state: Some(vec![0.1; STATE]), action: Some(vec![0.1; ACTION]), reward: Some(0.1), noise: 0.0 }; 10]; 64];
         let batch = WindowBatch {
             history: Tokens::pack(config.layout, &history).expect("packs"),
             window: random((batch_size, T, STATE + ACTION)),

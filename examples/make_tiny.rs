@@ -36,6 +36,7 @@ fn main() -> anyhow::Result<()> {
             reward: Affine::identity(1),
             state_change_std: vec![1.0; state_dim],
         },
+        sub_steps_trained: vec![2, 3, 5],
         refined: true,
         latent_spread: 1.0,
         restart: Restart::default(),

@@ -29,6 +29,9 @@ pub struct ModelConfig {
     pub action_high: Vec<f32>,
     /// Units.
     pub normalizer: Normalizer,
+    /// Sub-steps per rung, beside the default's, whose levels stage 2 trained.
+    #[serde(default)]
+    pub sub_steps_trained: Vec<usize>,
     /// Whether stage 2 trained the refinement that zig-zag does (section 4.3 of the paper).
     pub refined: bool,
     /// Root mean square spread of the prior's latent mean over the training data (all dimensions pooled): the yardstick of a latent jump.

@@ -97,6 +97,7 @@ impl Task {
             action_low: split.action_bounds.0.clone(),
             action_high: split.action_bounds.1.clone(),
             normalizer: split.normalizer.clone(),
+            sub_steps_trained: Vec::new(),
             refined: recipe.model.latent.is_some() && recipe.stage2.routing == LatentRouting::Matched,
             latent_spread: 0.0,
             restart: recipe.restart,

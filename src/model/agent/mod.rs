@@ -107,6 +107,8 @@ impl Agent {
         self.finish(descent)
     }
 
+    /// Whether a session may ask for these options. Sub-steps are those of training: a network that has seen no levels
+    /// between the rungs is lost there (measured on Point-Wind-S: -21 becomes -119 with 2 sub-steps instead of 1).
     fn check_options(&self, options: &SamplerOptions) -> Result<(), AgentError> {
         let horizon = self.config.plan_horizon;
         let invalid = |field, reason: String| Err(AgentError::InvalidOptions { field, reason });
@@ -115,6 +117,12 @@ impl Agent {
         }
         if let Err(reason) = Ladder::new(horizon, options.sub_steps, self.config.level_max) {
             return invalid("sub_steps", reason);
+        }
+        if !self.config.sub_steps_trained.contains(&options.sub_steps) && options.sub_steps != self.config.sampler.sub_steps {
+            return invalid(
+                "sub_steps",
+                format!("this checkpoint was not trained for the levels of {} sub-steps a rung", options.sub_steps),
+            );
         }
         if !(0.0..=1.0).contains(&options.eta) {
             return invalid("eta", format!("{} is outside 0..=1", options.eta));

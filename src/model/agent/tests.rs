@@ -35,6 +35,7 @@ fn agent(latents: bool, obs_horizon: usize, denoiser: DenoiserConfig) -> Agent {
             reward: Affine::identity(1),
             state_change_std: vec![1.0; 3],
         },
+        sub_steps_trained: (1..=10).collect(),
         refined: true,
         latent_spread: 1.0,
         restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY },
@@ -213,6 +214,8 @@ fn bad_options_name_the_field() {
     assert_eq!(field(&agent, SamplerOptions { kappa: -1.0, ..options() }), "kappa");
     agent.config.refined = false;
     assert_eq!(field(&agent, options()), "kappa");
+    agent.config.sub_steps_trained = vec![3];
+    assert_eq!(field(&agent, SamplerOptions { sub_steps: 2, ..options() }), "sub_steps");
 }
 
 /// With a window of one position and no latents the ladder is the plain sampler of Diffuser (all positions at one level): a textbook

@@ -35,6 +35,7 @@ fn config() -> ModelConfig {
             reward: Affine::identity(1),
             state_change_std: vec![1.0; STATE],
         },
+        sub_steps_trained: (1..=10).collect(),
         refined: true,
         latent_spread: 1.0,
         restart: Restart::default(),

@@ -1,32 +1,42 @@
 //! The engine by itself: a poisoned batch, and the end.
 
-use super::models_dir;
+use super::{models_dir, save};
 use ada_diffuser::{
     model::{
         agent::{Agent, Observation},
         checkpoint,
+        normalizer::Affine,
     },
     serve::engine::{Engine, Failure, Finished, Job, Question, Refusal, Ticket},
 };
 use std::{
+    path::Path,
     sync::{Arc, mpsc},
     time::{Duration, Instant},
 };
 
 type Outcome = Result<Finished, Failure>;
 
-struct Seat(mpsc::Sender<Outcome>);
+/// A ticket that can hold up the worker when its act is taken from the queue.
+struct Seat {
+    outcome: mpsc::Sender<Outcome>,
+    gate: Option<mpsc::Receiver<()>>,
+}
 
 impl Ticket for Seat {
     fn is_wanted(&self) -> bool {
         true
     }
 
-    fn start(&self) {}
+    fn start(&self) {
+        if let Some(gate) = &self.gate {
+            gate.recv().unwrap();
+        }
+    }
 
     fn settle(self, outcome: Outcome) {
         // A test that has seen enough does not listen any more.
-        let _unheard = self.0.send(outcome);
+        let _unheard = self.outcome.send(outcome);
     }
 }
 
@@ -34,38 +44,46 @@ fn agent(name: &str) -> Arc<Agent> {
     Arc::new(checkpoint::load(&models_dir().join(name)).unwrap())
 }
 
+/// A model of states with one value less than the others take.
+fn narrow(dir: &Path) -> Agent {
+    let mut config = checkpoint::load(&models_dir().join("tiny")).unwrap().config().clone();
+    config.layout.state_dim -= 1;
+    config.normalizer.state = Affine::identity(config.layout.state_dim);
+    config.normalizer.state_change_std.pop();
+    save(dir, &config, 1.0);
+    checkpoint::load(dir).unwrap()
+}
+
 /// An act of `asked` that is run on `run_on`.
 fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Receiver<Outcome>) {
     let episode = Arc::new(asked.open(seed, &asked.spec().sampler).unwrap());
-    let observation = Observation { state: vec![0.1, 0.2, 0.3, 0.4], executed: vec![] };
+    let observation = Observation { state: vec![0.1; asked.spec().layout.state_dim], executed: vec![] };
     let question = Question { episode, observation };
     let descent = question.begin(asked).unwrap();
-    let (sender, receiver) = mpsc::channel();
-    (Job { agent: run_on.clone(), question, descent, ticket: Seat(sender), submitted: Instant::now() }, receiver)
+    let (outcome, receiver) = mpsc::channel();
+    let ticket = Seat { outcome, gate: None };
+    (Job { agent: run_on.clone(), question, descent, ticket, submitted: Instant::now() }, receiver)
 }
 
-/// An act whose ladder the model does not have makes the shared forward fail or panic; its batch mates are answered as if it had not been there.
+/// An act of another model makes the shared forward fail; its batch mates are answered as if it had not been there.
 #[test]
 fn a_poisoned_act_fails_alone() {
-    let (tiny, slow) = (agent("tiny"), agent("slow"));
+    let dir = tempfile::tempdir().unwrap();
+    let (tiny, narrow) = (agent("tiny"), narrow(dir.path()));
     let engine = Engine::start(1, 64, 64).unwrap();
-    let (good, expected): (Vec<_>, Vec<_>) = (0..6)
-        .map(|seed| {
-            let (job, outcome) = job(&tiny, &tiny, seed);
-            let expected = tiny.act(&job.question.episode, &job.question.observation).unwrap().1;
-            ((job, outcome), expected)
-        })
-        .unzip();
-    let (poison, poisoned) = job(&slow, &tiny, 1);
-    let mut outcomes = Vec::new();
-    let mut poison = Some(poison);
-    for (i, (job, outcome)) in good.into_iter().enumerate() {
+    let (open_gate, gate) = mpsc::channel();
+    let mut gate = Some(gate);
+    let (mut outcomes, mut expected) = (Vec::new(), Vec::new());
+    for seed in 0..6 {
+        let (mut job, outcome) = job(&tiny, &tiny, seed);
+        expected.push(tiny.act(&job.question.episode, &job.question.observation).unwrap().1);
+        job.ticket.gate = gate.take();
         assert!(engine.submit(job).is_ok());
         outcomes.push(outcome);
-        if i == 2 {
-            assert!(engine.submit(poison.take().unwrap()).is_ok());
-        }
     }
+    let (poison, poisoned) = job(&narrow, &tiny, 1);
+    assert!(engine.submit(poison).is_ok());
+    open_gate.send(()).unwrap();
     for (outcome, expected) in outcomes.into_iter().zip(expected) {
         assert_eq!(outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap().chunk, expected);
     }

@@ -1,10 +1,16 @@
 //! Every row of the error table that a client can bring about, on both faces. (The rest, row by row, stands in the unit tests of the two tables.)
 
 use super::*;
+use ada_diffuser::serve::{grpc, registry::Registry, service::Service};
+use std::sync::Arc;
 
 /// The same failure on both faces; the gRPC side first.
 fn both(grpc: &Status, http: &Reply, expected: (Code, u16, &str)) {
-    assert_eq!((failure(grpc), (http.status, http.reason().as_str())), ((expected.0, expected.2.into()), (expected.1, expected.2)), "{grpc:?}");
+    assert_eq!(
+        (failure(grpc), (http.status, http.reason().as_str())),
+        ((expected.0, expected.2.into()), (expected.1, expected.2)),
+        "{grpc:?}"
+    );
 }
 
 /// The same act on both faces, both refused.
@@ -91,7 +97,10 @@ async fn observations_that_do_not_fit() {
     let id = server.open(json!({})).await;
     for state in [&[][..], &[0.0; 3], &[0.0; 5]] {
         let (grpc, http) = refused(&server, &id, 1, state, (Code::InvalidArgument, 400, "OBSERVATION_INVALID")).await;
-        assert_eq!((trailer(&grpc, "ada-field").as_deref(), &http.json()["field"]), (Some("observation.state"), &json!("observation.state")));
+        assert_eq!(
+            (trailer(&grpc, "ada-field").as_deref(), &http.json()["field"]),
+            (Some("observation.state"), &json!("observation.state"))
+        );
     }
     for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let grpc = server.agent().await.act(act(&id, 1, &[0.0, value, 0.0, 0.0])).await.unwrap_err();
@@ -136,7 +145,7 @@ async fn json_that_does_not_fit() {
         (r#"{"step":1,"observation":{"state":[0,0,0,1e39]}}"#, "observation.state[3]"),
         (r#"{"step":1,"observation":{"state":[0,0,0,NaN]}}"#, "observation.state[3]"),
         (r#"{"step":1,"observation":{"state":[0,0,0,0],"goal":1}}"#, "observation.goal"),
-        (r#"{"step":1,"step":1,"observation":{"state":[0,0,0,0]}}"#, "step"),
+        (r#"{"step":1,"step":1,"observation":{"state":[0,0,0,0]}}"#, "body"),
         (r#"{"step":1,"observation":{"state":[0,0,0,0],"executed":[{"actions":[0,0]}]}}"#, "observation.executed[0].actions"),
         (deep.as_str(), "body"),
     ] {
@@ -173,7 +182,8 @@ async fn requests_and_options_that_do_not_fit() {
     let grpc = server.agent().await.open_session(options(pb::SamplerOptions { latent: Some(9), ..none })).await.unwrap_err();
     assert_eq!(failure(&grpc), (Code::InvalidArgument, "OPTIONS_INVALID".into()));
     for ttl_ms in [0, u64::MAX] {
-        let grpc = server.agent().await.open_session(pb::OpenSessionRequest { ttl_ms: Some(ttl_ms), ..Default::default() }).await.unwrap_err();
+        let grpc =
+            server.agent().await.open_session(pb::OpenSessionRequest { ttl_ms: Some(ttl_ms), ..Default::default() }).await.unwrap_err();
         let http = server.post("/v1/sessions", &json!({"ttl_ms": ttl_ms})).await;
         both(&grpc, &http, (Code::InvalidArgument, 400, "REQUEST_INVALID"));
     }
@@ -216,13 +226,14 @@ async fn a_full_queue_and_passed_deadlines() {
         (server.open(json!({"model": "slow"})).await, server.open(json!({})).await, server.open(json!({})).await);
     let hasty = |id: &str, ms| pb::ActRequest { deadline_ms: Some(ms), ..act(id, 1, &STATE) };
     let hasty_http = |ms: u32| json!({"step": 1, "observation": {"state": STATE}, "deadline_ms": ms});
-    for (ms, reason) in [(0, "DEADLINE_ADMISSION"), (50, "DEADLINE_COMPUTE")] {
+    for (ms, reason) in [(0, "DEADLINE_ADMISSION"), (300, "DEADLINE_COMPUTE")] {
         let grpc = server.agent().await.act(hasty(&running, ms)).await.unwrap_err();
         let http = server.post(&format!("/v1/sessions/{running}/act"), &hasty_http(ms)).await;
         both(&grpc, &http, (Code::DeadlineExceeded, 504, reason));
     }
     let blocker = server.start_slow(&running).await;
-    while server.metric("ada_inflight_acts").await < 1.0 {}
+    // The acts before may still be on their way out of the batch.
+    while server.metric("ada_inflight_acts").await < 1.0 || server.metric("ada_queue_depth").await > 0.0 {}
     let grpc = server.agent().await.act(hasty(&waiting, 50)).await.unwrap_err();
     let http = server.post(&format!("/v1/sessions/{waiting}/act"), &hasty_http(50)).await;
     both(&grpc, &http, (Code::DeadlineExceeded, 504, "DEADLINE_QUEUE"));
@@ -232,10 +243,25 @@ async fn a_full_queue_and_passed_deadlines() {
     blocker.abort();
     assert_eq!(queued.await.unwrap().unwrap().step, 1, "the next one has the worker at once");
     assert_eq!(server.act(&third, 1, &STATE).await.status, 200, "nothing is lost");
-    let mut request = tonic::Request::new(act(&running, 1, &STATE));
-    request.metadata_mut().insert("grpc-timeout", "50m".parse().unwrap());
-    let late = server.agent().await.act(request).await.unwrap_err();
-    assert_eq!(late.code(), Code::DeadlineExceeded, "the call's own timeout counts: {late:?}");
+}
+
+/// The call's own timeout counts like `deadline_ms`. (Without a socket: a stock client would end the call by itself at the same moment.)
+#[tokio::test(flavor = "multi_thread")]
+async fn the_timeout_of_a_grpc_call() {
+    let config = config().validated().unwrap();
+    let registry = Registry::load(&config.models).unwrap();
+    let service = Arc::new(Service::start(config).unwrap());
+    service.set_registry(registry);
+    let (router, _) = grpc::router(service).unwrap();
+    let mut agent = AgentClient::new(router);
+    let open = pb::OpenSessionRequest { model: "slow".into(), ..Default::default() };
+    let id = agent.open_session(open).await.unwrap().into_inner().session.unwrap().session_id;
+    for deadline_ms in [None, Some(60_000)] {
+        let mut request = tonic::Request::new(pb::ActRequest { deadline_ms, ..act(&id, 1, &STATE) });
+        request.metadata_mut().insert("grpc-timeout", "300m".parse().unwrap());
+        let late = timeout(Duration::from_secs(10), agent.act(request)).await.expect("it was not heard").unwrap_err();
+        assert_eq!(failure(&late), (Code::DeadlineExceeded, "DEADLINE_COMPUTE".into()));
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -116,7 +116,9 @@ async fn the_faces_describe_themselves() {
     ];
     assert_eq!(paths, expected);
     assert!(api["components"]["schemas"]["ActBody"]["properties"]["observation"].is_object());
-    use tonic_reflection::pb::v1::{ServerReflectionRequest, server_reflection_client::ServerReflectionClient, server_reflection_request::MessageRequest};
+    use tonic_reflection::pb::v1::{
+        ServerReflectionRequest, server_reflection_client::ServerReflectionClient, server_reflection_request::MessageRequest,
+    };
     let list = ServerReflectionRequest { host: String::new(), message_request: Some(MessageRequest::ListServices(String::new())) };
     let mut reflection = ServerReflectionClient::new(server.channel().await);
     let mut answers = reflection.server_reflection_info(tokio_stream::iter([list])).await.unwrap().into_inner();
