@@ -1,4 +1,5 @@
 //! `ada-trainer` as a process: killed, interrupted, asked wrong questions.
+#![allow(clippy::unwrap_used)] // what serves tests alone is a test
 
 use std::{
     fs,
