@@ -164,7 +164,7 @@ impl Store {
         }
         let header = Header { identity: self.identity.clone(), position: snapshot.position, adam_steps, probes: snapshot.probes.clone() };
         let metadata = HashMap::from([(KEY.to_string(), serde_json::to_string(&header)?)]);
-        let bytes = safetensors::serialize(tensors.iter().map(|(name, tensor)| (name, tensor)), Some(metadata))?;
+        let bytes = safetensors::serialize(&tensors, Some(metadata))?;
         write_beside(&self.path, &bytes).with_context(|| format!("cannot write {}", self.path.display()))
     }
 }

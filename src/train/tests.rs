@@ -8,50 +8,7 @@ use std::{
     sync::{Arc, atomic::AtomicBool},
 };
 
-const RECIPE: &str = r#"
-name = "small"
-seed = 3
-data = "tests/golden/data_good.h5"
-checkpoint_every = 4
-log_every = 2
-[model]
-plan_horizon = 4
-block_len = 3
-obs_horizon = 2
-level_max = 8
-state_clip = 5.0
-latent = { dim = 2, hidden = 4 }
-denoiser = { kind = "unet", widths = [8, 16] }
-[stage1]
-steps = 9
-batch = 4
-length = 5
-learning_rate = { peak = 3e-3, end = 1e-4, warm_up = 2, decay = "cosine" }
-weight_decay = 0.0
-kl_weight = { start = 0.01, end = 0.1, steps = 5 }
-reward_weight = 1.0
-show_action = 0.5
-show_reward = 0.5
-[stage2]
-steps = 9
-batch = 4
-learning_rate = { peak = 1e-3, end = 1e-4, warm_up = 2, decay = "linear" }
-weight_decay = 0.01
-latent_lr_factor = 0.1
-elbo_weight = 0.1
-routing = "matched"
-first_action_weight = 10.0
-ready_fraction = 0.5
-ema_decay_max = 0.995
-[sampler]
-streaming = true
-action_horizon = 2
-sub_steps = 2
-eta = 0.0
-temperature = 0.5
-kappa = inf
-latent = "mean"
-"#;
+const RECIPE: &str = include_str!("../../tests/golden/small.toml");
 
 fn recipe_with(overrides: &[&str]) -> Result<Recipe, super::recipe::RecipeError> {
     let dir = tempfile::tempdir().unwrap();

@@ -296,9 +296,9 @@ mod tests {
         for row in 0..shape.batch {
             let first = window[row][0][0];
             let t = first as usize % 100;
-            for position in 0..4 {
+            for (position, step) in window[row].iter().enumerate() {
                 let at = first + position as f32;
-                assert_eq!(window[row][position], [at, -at, (t + position) as f32 / 10.0]);
+                assert_eq!(*step, [at, -at, (t + position) as f32 / 10.0]);
             }
             for back in 1..=3_usize {
                 let real = t >= back;
