@@ -60,13 +60,22 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         server = subprocess.Popen(command, stdout=log, stderr=log)
     try:
         with Client(f"http://{address}") as client:
-            client.wait_ready(60)
+            ready = any(_is_ready(client) for _ in range(60) if server.poll() is None)
+        assert ready, f"the server ended, or is not ready after a minute:\n{(folder / 'log').read_text()}"
         yield address
         server.send_signal(signal.SIGTERM)
         assert server.wait(30) == 0, (folder / "log").read_text()
     finally:
         server.kill()
         server.wait()
+
+
+def _is_ready(client: Client) -> bool:
+    try:
+        client.wait_ready(1)
+    except Unavailable:
+        return False
+    return True
 
 
 @pytest.fixture(params=FACES)
