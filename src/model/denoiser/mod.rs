@@ -50,8 +50,8 @@ pub struct Condition<'a> {
 }
 
 enum Backbone {
-    Unet(Unet),
-    Dit(Dit),
+    Unet(Box<Unet>),
+    Dit(Box<Dit>),
 }
 
 /// What a backbone is given: the input channels of each position, their levels, and a vector for the whole window.
@@ -80,9 +80,9 @@ impl Denoiser {
         let d_out = config.layout.dim();
         let d_in = d_out + config.latent.as_ref().map_or(0, |latent| latent.dim) + LEVEL_CHANNELS;
         let (backbone, emb) = match &config.denoiser {
-            DenoiserConfig::Unet { widths } => (Backbone::Unet(Unet::new(d_in, d_out, widths, params)?), unet::EMB),
+            DenoiserConfig::Unet { widths } => (Backbone::Unet(Box::new(Unet::new(d_in, d_out, widths, params)?)), unet::EMB),
             DenoiserConfig::Dit { width, depth, heads } => {
-                (Backbone::Dit(Dit::new([d_in, d_out], *width, [*depth, *heads], params)?), *width)
+                (Backbone::Dit(Box::new(Dit::new([d_in, d_out], *width, [*depth, *heads], params)?)), *width)
             }
         };
         let observed = match config.obs_horizon {

@@ -67,7 +67,7 @@ fn strided_input_and_rows_alone() {
         let strided = scrambled(&x, 0, x.rank() - 1);
         assert_eq!(bits(&layer(&strided, &params).unwrap()), bits(&y));
         let through = |inputs: &[Tensor]| layer(&inputs[0].transpose(0, inputs[0].rank() - 1)?, &params);
-        let straight = gradients(&[x.clone()], &|inputs| layer(&inputs[0], &params));
+        let straight = gradients(std::slice::from_ref(&x), &|inputs| layer(&inputs[0], &params));
         let back = gradients(&[x.transpose(0, x.rank() - 1).unwrap().contiguous().unwrap()], &through);
         assert_eq!(bits(&back[0].transpose(0, x.rank() - 1).unwrap()), bits(&straight[0]));
         check_rows(&[x], &|inputs| layer(&inputs[0], &params));
@@ -115,8 +115,8 @@ fn gru_packed_once_gives_the_same_bits() {
 fn attention_against_central_differences() {
     for (batch, steps, heads, head_dim) in [(2, 3, 2, 4), (2, 17, 1, 3), (1, 2, 3, 17)] {
         let qkv = gaussian(1, (batch, steps, 3 * heads * head_dim));
-        check_gradients(&[qkv.clone()], &|inputs| attention(&inputs[0], heads));
-        check_rows(&[qkv.clone()], &|inputs| attention(&inputs[0], heads));
+        check_gradients(std::slice::from_ref(&qkv), &|inputs| attention(&inputs[0], heads));
+        check_rows(std::slice::from_ref(&qkv), &|inputs| attention(&inputs[0], heads));
         assert_eq!(bits(&attention(&scrambled(&qkv, 1, 2), heads).unwrap()), bits(&attention(&qkv, heads).unwrap()));
     }
 }
@@ -138,7 +138,7 @@ fn activations_against_central_differences() {
         // No value within a step of relu's corner.
         let x = gaussian(1, (3, 11)).affine(1.0, 0.0).unwrap();
         let away = x.abs().unwrap().ge(0.02).unwrap().where_cond(&x, &x.ones_like().unwrap()).unwrap();
-        check_gradients(&[away.clone()], &|inputs| activation(&inputs[0]));
+        check_gradients(std::slice::from_ref(&away), &|inputs| activation(&inputs[0]));
         check_rows(&[away], &|inputs| activation(&inputs[0]));
     }
 }
@@ -148,7 +148,7 @@ fn activations_against_central_differences() {
 fn gradients_far_out_are_finite() {
     let x = Tensor::new(&[-1e4_f32, -89.0, -20.5, 20.5, 89.0, 1e4], &candle_core::Device::Cpu).unwrap();
     for activation in [mish, silu, gelu_tanh, relu] {
-        let grad = gradients(&[x.clone()], &|inputs| activation(&inputs[0]));
+        let grad = gradients(std::slice::from_ref(&x), &|inputs| activation(&inputs[0]));
         assert!(flat(&grad[0]).iter().all(|grad| grad.is_finite()));
     }
 }

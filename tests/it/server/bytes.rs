@@ -9,8 +9,12 @@ const STEPS: u64 = 4;
 fn observation(seed: usize, step: u64) -> pb::Observation {
     let wave = |i: usize| ((seed * 31 + step as usize * 7 + i * 3) as f32 * 0.37).sin();
     let vector = |from: usize, len: usize| pb::Vector { values: (from..from + len).map(wave).collect() };
-    let executed = pb::Executed { state: None, action: (seed % 2 == 0).then(|| vector(10, 2)), reward: (seed % 3 == 0).then(|| wave(20)) };
-    let executed = if step > 1 && seed % 5 > 0 { vec![executed] } else { vec![] };
+    let executed = pb::Executed {
+        state: None,
+        action: seed.is_multiple_of(2).then(|| vector(10, 2)),
+        reward: seed.is_multiple_of(3).then(|| wave(20)),
+    };
+    let executed = if step > 1 && !seed.is_multiple_of(5) { vec![executed] } else { vec![] };
     pb::Observation { state: vector(0, 4).values, executed }
 }
 
