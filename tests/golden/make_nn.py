@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional
 
 Forward = Callable[[nn.Module, dict[str, Tensor]], Tensor]
 
@@ -30,7 +30,7 @@ def attend(qkv: Tensor, heads: int) -> Tensor:
     """Self-attention over rows that hold q, k, v."""
     batch, steps, width = qkv.shape
     q, k, v = qkv.view(batch, steps, 3, heads, width // (3 * heads)).permute(2, 0, 3, 1, 4)
-    return F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(batch, steps, width // 3)
+    return functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(batch, steps, width // 3)
 
 
 def sinusoid(levels: Tensor, dim: int) -> Tensor:
@@ -57,7 +57,7 @@ def cases() -> dict[str, tuple[nn.Module, dict[str, tuple[int, ...]], Forward]]:
         "conv": conv(nn.Conv1d(6, 20, 5, padding=2), 3, 9, 6),
         "conv_stride": conv(nn.Conv1d(6, 10, 3, 2, 1), 3, 9, 6),
         "conv_transpose": conv(nn.ConvTranspose1d(6, 10, 4, 2, 1), 3, 5, 6),
-        "group_norm_mish": (nn.GroupNorm(4, 20), {"x": (3, 6, 20)}, lambda m, i: F.mish(last(m, i["x"]))),
+        "group_norm_mish": (nn.GroupNorm(4, 20), {"x": (3, 6, 20)}, lambda m, i: functional.mish(last(m, i["x"]))),
         "layer_norm": one(nn.LayerNorm(21), 3, 4, 21),
         "layer_norm_plain": one(nn.LayerNorm(21, elementwise_affine=False, eps=1e-6), 3, 4, 21),
         "gru": (
@@ -66,10 +66,10 @@ def cases() -> dict[str, tuple[nn.Module, dict[str, tuple[int, ...]], Forward]]:
             lambda m, i: m(i["x"], i["h0"][None])[0],
         ),
         "attention": plain(lambda x: attend(x, 2), 3, 7, 30),
-        "mish": plain(F.mish, 4, 25),
-        "silu": plain(F.silu, 4, 25),
-        "gelu_tanh": plain(lambda x: F.gelu(x, approximate="tanh"), 4, 25),
-        "relu": plain(F.relu, 4, 25),
+        "mish": plain(functional.mish, 4, 25),
+        "silu": plain(functional.silu, 4, 25),
+        "gelu_tanh": plain(lambda x: functional.gelu(x, approximate="tanh"), 4, 25),
+        "relu": plain(functional.relu, 4, 25),
     }
 
 

@@ -1,6 +1,6 @@
 //! The engine: threads of its own that run many acts at once, one network evaluation at a time.
 //!
-//! An act waits in the bounded [`queue`]; a [`worker`] takes it into its batch; each [`tick`] is one evaluation shared by all acts of the batch. Acts join
+//! An act waits in the bounded `queue`; a `worker` takes it into its batch; each `tick` is one evaluation shared by all acts of the batch. Acts join
 //! and leave between ticks, so nobody waits for another's ladder to end. The engine knows neither sessions nor clients: it gives each outcome to a ticket.
 
 mod queue;
