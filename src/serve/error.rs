@@ -242,7 +242,7 @@ impl ServiceError {
 
 #[cfg(test)]
 impl ServiceError {
-    /// One of each kind with its codes in both tables and its word, as service.md lists them: (error, gRPC, HTTP, reason).
+    /// One of each kind with its codes in both tables and its word: (error, gRPC, HTTP, reason).
     pub fn table() -> Vec<(Self, i32, u16, &'static str)> {
         let (id, retry_after_ms, committed, step) = (Uuid::nil(), 1500, 3, 9);
         vec![

@@ -92,7 +92,7 @@ impl Descent {
         self.episode.time + self.actions.len() as u64
     }
 
-    /// Chooses between the stored window and a cold start, and fills the window (section 6.6 of the design: the stored window was built for
+    /// Chooses between the stored window and a cold start, and fills the window (the stored one was built for
     /// a predicted state and an older latent; a little surprise is noised away, a great one or a jump of the latent starts anew).
     pub(super) fn start(&mut self, walk: &Walk) {
         let stored = self.episode.window.take().filter(|_| self.aligned && self.episode.options.streaming);

@@ -25,7 +25,7 @@ pub enum LatentRouting {
     Matched,
     /// Prior roll-out everywhere: no refinement is trained ("w/o refine").
     PriorOnly,
-    /// Posteriors of the clean window, teacher-forced (section 7.3 read literally); leaks, for the ablation.
+    /// Posteriors of the clean window, teacher-forced (algorithm 2 of the paper read literally); leaks, for the ablation.
     Literal,
 }
 
