@@ -34,7 +34,7 @@ test: test-rust test-python ## Every check there is.
 test-rust: tools
 	cargo test $(CARGO_FLAGS)
 
-test-python: build venv
+test-python: test-binaries venv
 	$(BIN)/python -m pytest -q tests/python
 
 lint: venv ## Formatting, clippy, docs and ruff, all with warnings as errors.
@@ -52,7 +52,11 @@ proto-python: tools ## Writes the Python stubs anew from proto/, with the lowest
 	target/proto-venv/bin/pip install --quiet --disable-pip-version-check grpcio-tools==1.72.2
 	target/proto-venv/bin/python -m grpc_tools.protoc -I proto --python_out=clients/python --grpc_python_out=clients/python --pyi_out=clients/python proto/ada_diffuser/v1/*.proto
 
-.PHONY: build venv
+# With --tests the features of the test dependencies count, as in `cargo test`: so one build serves both halves of `make test`.
+.PHONY: build test-binaries venv
+test-binaries: tools
+	cargo build $(CARGO_FLAGS) --bins --tests
+
 build: tools
 	cargo build $(CARGO_FLAGS) --bins
 
