@@ -6,11 +6,8 @@ The binary is `$ADA_SERVER`, else `target/release/ada-server`. Without one these
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 import socket
-import subprocess
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from server import ROOT, running
 
 from ada_diffuser import (
     Chunk,
@@ -39,8 +37,6 @@ from ada_diffuser.commands import evaluate as evaluate_command
 from ada_diffuser.commands import rollout as rollout_command
 from ada_diffuser.rollout import Trial, evaluate
 
-ROOT = Path(__file__).resolve().parents[2]
-BINARY = Path(os.environ.get("ADA_SERVER", ROOT / "target/release/ada-server"))
 FACES = ("grpc", "http")
 STATES = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 4)).astype(np.float32)
 
@@ -48,34 +44,10 @@ STATES = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 4)).astype(np.float32)
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """`host:port` of a server that runs for this module, and must end by itself when told to."""
-    if not BINARY.exists():
-        reason = f"no server at {BINARY}: build it with `cargo build --release --locked`"
-        pytest.fail(reason) if os.environ.get("CI") == "true" else pytest.skip(reason)
     folder = tmp_path_factory.mktemp("server")
     shutil.copytree(ROOT / "models/tiny", folder / "models/tiny")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    command = [str(BINARY), "--listen", address, "--models", str(folder / "models"), "--default-model", "tiny"]
-    with (folder / "log").open("wb") as log:
-        server = subprocess.Popen(command, stdout=log, stderr=log)
-    try:
-        with Client(f"http://{address}") as client:
-            ready = any(_is_ready(client) for _ in range(60) if server.poll() is None)
-        assert ready, f"the server ended, or is not ready after a minute:\n{(folder / 'log').read_text()}"
+    with running(folder / "log", "--models", str(folder / "models"), "--default-model", "tiny") as address:
         yield address
-        server.send_signal(signal.SIGTERM)
-        assert server.wait(30) == 0, (folder / "log").read_text()
-    finally:
-        server.kill()
-        server.wait()
-
-
-def _is_ready(client: Client) -> bool:
-    try:
-        client.wait_ready(1)
-    except Unavailable:
-        return False
-    return True
 
 
 @pytest.fixture(params=FACES)

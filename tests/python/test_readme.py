@@ -2,39 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import re
-import signal
-import socket
 import subprocess
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
+from server import ROOT, running
 
-from ada_diffuser import Client, environments
-
-ROOT = Path(__file__).resolve().parents[2]
-BINARY = Path(os.environ.get("ADA_SERVER", ROOT / "target/release/ada-server"))
+from ada_diffuser import environments
 
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    if not BINARY.exists():
-        pytest.fail(f"no server at {BINARY}: build it with `make build`")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    with (tmp_path_factory.mktemp("server") / "log").open("wb") as log:
-        server = subprocess.Popen([str(BINARY), "--listen", address], cwd=ROOT, stdout=log, stderr=log)
-    try:
-        with Client(f"http://{address}") as client:
-            client.wait_ready(60)
+    with running(tmp_path_factory.mktemp("server") / "log") as address:
         yield address
-        server.send_signal(signal.SIGTERM)
-        assert server.wait(30) == 0
-    finally:
-        server.kill()
-        server.wait()
 
 
 def examples(language: str, path: str = "README.md") -> list[str]:

@@ -1,0 +1,44 @@
+"""The real server as a process, for the tests that need one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ada_diffuser import Client, Unavailable
+
+ROOT = Path(__file__).resolve().parents[2]
+BINARY = Path(os.environ.get("ADA_SERVER", ROOT / "target/release/ada-server"))
+
+
+@contextmanager
+def running(log: Path, *flags: str, kill: bool = False) -> Iterator[str]:
+    """`host:port` of a server over `models/`; at the end it is told to stop and must obey, or is killed with SIGKILL."""
+    assert BINARY.exists(), f"no server at {BINARY}: build it with `make build`"
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    with log.open("wb") as sink:
+        server = subprocess.Popen([str(BINARY), "--listen", address, *flags], cwd=ROOT, stdout=sink, stderr=sink)
+    try:
+        with Client(f"http://{address}") as client:
+            ready = any(_is_ready(client) for _ in range(60) if server.poll() is None)
+        assert ready, f"the server ended, or is not ready after a minute:\n{log.read_text()}"
+        yield address
+        server.send_signal(signal.SIGKILL if kill else signal.SIGTERM)
+        assert server.wait(30) == (-signal.SIGKILL if kill else 0), log.read_text()
+    finally:
+        server.kill()
+        server.wait()
+
+
+def _is_ready(client: Client) -> bool:
+    try:
+        client.wait_ready(1)
+    except Unavailable:
+        return False
+    return True
