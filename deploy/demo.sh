@@ -1,7 +1,7 @@
 #!/bin/sh
 # Starts the server on a free port, lets the default model drive HalfCheetah in a hidden wind, and leaves a plot and a film in out/.
 set -eu
-episodes=${DEMO_EPISODES:-8}
+episodes=${DEMO_EPISODES:-32}
 python=.venv/bin/python
 mkdir -p out
 port=$($python -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')

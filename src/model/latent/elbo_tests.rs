@@ -69,12 +69,12 @@ fn gradient_is_the_central_difference() {
             var.set(&(&start + direction.affine(step, 0.0).unwrap()).unwrap()).unwrap();
             loss(&model)
         };
-        let slopes = [1e-3, 3e-4, 1e-4].map(|step| (at(step) - at(-step)) / (2.0 * step));
+        let slopes = [3e-3, 1e-3, 3e-4].map(|step| (at(step) - at(-step)) / (2.0 * step));
         var.set(&start).unwrap();
         let analytic = grads.get(&var).map_or(0.0, |grad| (grad * &direction).unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap());
         // The best of three steps: a large one may cross kinks of the ReLUs, a small one drowns in rounding.
         let error = slopes.map(|slope| (slope - f64::from(analytic)).abs()).into_iter().fold(f64::INFINITY, f64::min);
-        assert!(error < 2e-4 + 0.02 * f64::from(analytic.abs()), "{name}: {analytic} against {slopes:?}");
+        assert!(error < 5e-4 + 0.02 * f64::from(analytic.abs()), "{name}: {analytic} against {slopes:?}");
     }
 }
 

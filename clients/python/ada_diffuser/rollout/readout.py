@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ada_diffuser.rollout.result import Episode
 
-#: Weight of the penalty, for standardised latents, per sample.
-RIDGE = 1e-3
+#: Weights of the penalty to choose from, for standardised latents, per sample.
+PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +40,8 @@ def fit(episodes: Sequence[Episode]) -> Readout | str:
         return "this model has no latent to read out"
     if not episodes[0].contexts:
         return "this environment does not tell its context"
-    latents, contexts = _pairs(episodes[:first_shown])
-    weights = _ridge(latents, contexts)
+    fitted = episodes[:first_shown]
+    weights = _ridge(*_pairs(fitted), min(PENALTIES, key=lambda penalty: _left_out_error(fitted, penalty)))
     shown_latents, shown = _pairs(episodes[first_shown:])
     error = np.sum((shown - _with_one(shown_latents) @ weights) ** 2)
     spread = np.sum((shown - shown.mean(axis=0)) ** 2)
@@ -50,13 +50,23 @@ def fit(episodes: Sequence[Episode]) -> Readout | str:
     return Readout(weights, first_shown, float(1 - error / spread))
 
 
-def _ridge(latents: NDArray[np.float64], contexts: NDArray[np.float64]) -> NDArray[np.float64]:
+def _left_out_error(episodes: Sequence[Episode], penalty: float) -> float:
+    """Squared error on each episode in turn, fitted on the others (0 if there are none): a weak latent needs a strong penalty."""
+    error = 0.0
+    for index in range(len(episodes) if len(episodes) > 1 else 0):
+        others = [*episodes[:index], *episodes[index + 1 :]]
+        latents, contexts = _pairs(episodes[index : index + 1])
+        error += float(np.sum((contexts - _with_one(latents) @ _ridge(*_pairs(others), penalty)) ** 2))
+    return error
+
+
+def _ridge(latents: NDArray[np.float64], contexts: NDArray[np.float64], penalty: float) -> NDArray[np.float64]:
     """Weights in the latents' own units; the penalty is on standardised latents, and not on the offset."""
     mean, scale = latents.mean(axis=0), latents.std(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     z = (latents - mean) / scale
     centred = contexts - contexts.mean(axis=0)
-    slopes = np.linalg.solve(z.T @ z + RIDGE * len(z) * np.eye(z.shape[1]), z.T @ centred) / scale[:, None]
+    slopes = np.linalg.solve(z.T @ z + penalty * len(z) * np.eye(z.shape[1]), z.T @ centred) / scale[:, None]
     return np.vstack([slopes, contexts.mean(axis=0) - mean @ slopes])
 
 
