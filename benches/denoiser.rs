@@ -4,14 +4,13 @@
 
 use ada_diffuser::model::{
     Networks,
-    agent::{Agent, LatentMode, Observation, SamplerOptions},
+    agent::{Agent, Observation, SamplerOptions},
     config::{ModelConfig, Restart},
     denoiser::{Condition, DenoiserConfig},
     diffusion::refine::{LatentRouting, RefineOptions, WindowBatch},
     latent::LatentConfig,
     nn::params::Params,
     noise::Philox,
-    normalizer::{Affine, Normalizer},
     trajectory::{Layout, Token, Tokens},
 };
 use candle_core::{Device, Tensor};
@@ -23,37 +22,9 @@ const STATE: usize = 17;
 const ACTION: usize = 6;
 
 fn config(denoiser: DenoiserConfig) -> ModelConfig {
-    ModelConfig {
-        layout: Layout { state_dim: STATE, action_dim: ACTION },
-        plan_horizon: T,
-        block_len: 10,
-        obs_horizon: 1,
-        level_max: 150,
-        latent: Some(LatentConfig { dim: 20, hidden: 64 }),
-        denoiser,
-        state_clip: 5.0,
-        action_low: vec![-1.0; ACTION],
-        action_high: vec![1.0; ACTION],
-        normalizer: Normalizer {
-            state: Affine::identity(STATE),
-            action: Affine::identity(ACTION),
-            reward: Affine::identity(1),
-            state_change_std: vec![1.0; STATE],
-        },
-        sub_steps_trained: Vec::new(),
-        refined: true,
-        latent_spread: 1.0,
-        restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY },
-        sampler: SamplerOptions {
-            streaming: true,
-            action_horizon: 1,
-            sub_steps: 1,
-            eta: 0.0,
-            temperature: 0.5,
-            kappa: 0.1,
-            latent: LatentMode::Mean,
-        },
-    }
+    let plain = ModelConfig::plain(Layout { state_dim: STATE, action_dim: ACTION }, Some(LatentConfig { dim: 20, hidden: 64 }), denoiser);
+    let never = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
+    ModelConfig { plan_horizon: T, block_len: 10, level_max: 150, restart: never, ..plain }
 }
 
 fn nets() -> [(&'static str, DenoiserConfig); 3] {

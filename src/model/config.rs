@@ -1,6 +1,12 @@
 //! What a model is, apart from its weights: the content of a checkpoint's `config.json`.
 
-use crate::model::{agent::SamplerOptions, denoiser::DenoiserConfig, latent::LatentConfig, normalizer::Normalizer, trajectory::Layout};
+use crate::model::{
+    agent::SamplerOptions,
+    denoiser::DenoiserConfig,
+    latent::LatentConfig,
+    normalizer::{Affine, Normalizer},
+    trajectory::Layout,
+};
 use serde::{Deserialize, Serialize};
 
 /// Architecture, units and sampling defaults of one model.
@@ -62,6 +68,34 @@ impl Default for Restart {
 }
 
 impl ModelConfig {
+    /// Plain units (no normalization, actions in [-1, 1]) and defaults for everything but the sizes that must be said: where tests,
+    /// benches and examples start.
+    pub fn plain(layout: Layout, latent: Option<LatentConfig>, denoiser: DenoiserConfig) -> Self {
+        Self {
+            layout,
+            plan_horizon: 8,
+            block_len: 4,
+            obs_horizon: 1,
+            level_max: 40,
+            latent,
+            denoiser,
+            state_clip: 5.0,
+            action_low: vec![-1.0; layout.action_dim],
+            action_high: vec![1.0; layout.action_dim],
+            normalizer: Normalizer {
+                state: Affine::identity(layout.state_dim),
+                action: Affine::identity(layout.action_dim),
+                reward: Affine::identity(1),
+                state_change_std: vec![1.0; layout.state_dim],
+            },
+            sub_steps_trained: Vec::new(),
+            refined: true,
+            latent_spread: 1.0,
+            restart: Restart::default(),
+            sampler: SamplerOptions::default(),
+        }
+    }
+
     /// Whether the sizes fit together; the networks check their own.
     ///
     /// # Errors

@@ -2,45 +2,23 @@
 
 use super::*;
 use crate::model::{
-    config::Restart,
-    denoiser::DenoiserConfig,
-    latent::LatentConfig,
-    nn::params::Params,
-    noise::Philox,
-    normalizer::{Affine, Normalizer},
+    config::Restart, denoiser::DenoiserConfig, latent::LatentConfig, nn::params::Params, noise::Philox, normalizer::Affine,
     trajectory::Layout,
 };
 
 const HORIZON: usize = 8;
 
 fn options() -> SamplerOptions {
-    SamplerOptions { streaming: true, action_horizon: 1, sub_steps: 1, eta: 0.0, temperature: 0.5, kappa: 0.1, latent: LatentMode::Mean }
+    SamplerOptions::default()
 }
 
 fn agent(latents: bool, obs_horizon: usize, denoiser: DenoiserConfig) -> Agent {
-    let config = ModelConfig {
-        layout: Layout { state_dim: 3, action_dim: 2 },
-        plan_horizon: HORIZON,
-        block_len: 4,
-        obs_horizon,
-        level_max: 40,
-        latent: latents.then_some(LatentConfig { dim: 5, hidden: 16 }),
-        denoiser,
-        state_clip: 5.0,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        normalizer: Normalizer {
-            state: Affine { mean: vec![0.5, 0.0, -0.5], std: vec![2.0, 1.0, 0.5] },
-            action: Affine::identity(2),
-            reward: Affine::identity(1),
-            state_change_std: vec![1.0; 3],
-        },
-        sub_steps_trained: (1..=10).collect(),
-        refined: true,
-        latent_spread: 1.0,
-        restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY },
-        sampler: options(),
-    };
+    let latent = latents.then_some(LatentConfig { dim: 5, hidden: 16 });
+    let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, latent, denoiser);
+    config.normalizer.state = Affine { mean: vec![0.5, 0.0, -0.5], std: vec![2.0, 1.0, 0.5] };
+    config.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
+    config.sub_steps_trained = (1..=10).collect();
+    config.obs_horizon = obs_horizon;
     let networks = Networks::new(&config, &Params::fresh(3)).unwrap();
     Agent::new(config, networks, "test".into())
 }

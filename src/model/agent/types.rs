@@ -24,6 +24,12 @@ pub struct SamplerOptions {
     pub latent: LatentMode,
 }
 
+impl Default for SamplerOptions {
+    fn default() -> Self {
+        Self { streaming: true, action_horizon: 1, sub_steps: 1, eta: 0.0, temperature: 0.5, kappa: 0.1, latent: LatentMode::Mean }
+    }
+}
+
 /// How a latent is taken from its Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

@@ -1,16 +1,7 @@
 //! The leak, held shut: training latents depend on nothing that the sampler does not have.
 
 use super::*;
-use crate::model::{
-    agent::{LatentMode, SamplerOptions},
-    config::Restart,
-    denoiser::DenoiserConfig,
-    latent::LatentConfig,
-    nn::params::Params,
-    noise::Philox,
-    normalizer::{Affine, Normalizer},
-    trajectory::Token,
-};
+use crate::model::{denoiser::DenoiserConfig, latent::LatentConfig, nn::params::Params, noise::Philox, trajectory::Token};
 
 const BATCH: usize = 6;
 const LEN: usize = 4;
@@ -18,37 +9,10 @@ const DIM: usize = 5;
 const STATE: usize = 3;
 
 fn config() -> ModelConfig {
-    ModelConfig {
-        layout: Layout { state_dim: STATE, action_dim: DIM - STATE },
-        plan_horizon: LEN,
-        block_len: 3,
-        obs_horizon: 1,
-        level_max: 20,
-        latent: Some(LatentConfig { dim: 4, hidden: 8 }),
-        denoiser: DenoiserConfig::Dit { width: 16, depth: 1, heads: 2 },
-        state_clip: 5.0,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        normalizer: Normalizer {
-            state: Affine::identity(STATE),
-            action: Affine::identity(2),
-            reward: Affine::identity(1),
-            state_change_std: vec![1.0; STATE],
-        },
-        sub_steps_trained: (1..=10).collect(),
-        refined: true,
-        latent_spread: 1.0,
-        restart: Restart::default(),
-        sampler: SamplerOptions {
-            streaming: true,
-            action_horizon: 1,
-            sub_steps: 1,
-            eta: 0.0,
-            temperature: 0.5,
-            kappa: 0.1,
-            latent: LatentMode::Mean,
-        },
-    }
+    let layout = Layout { state_dim: STATE, action_dim: DIM - STATE };
+    let denoiser = DenoiserConfig::Dit { width: 16, depth: 1, heads: 2 };
+    let plain = ModelConfig::plain(layout, Some(LatentConfig { dim: 4, hidden: 8 }), denoiser);
+    ModelConfig { plan_horizon: LEN, block_len: 3, level_max: 20, ..plain }
 }
 
 fn options(routing: LatentRouting) -> RefineOptions {
