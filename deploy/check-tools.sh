@@ -9,8 +9,8 @@ need cc "apt-get install build-essential"
 need cargo "curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs | sh"
 need "$python" "apt-get install python3 python3-venv"
 if command -v "$python" >/dev/null 2>&1; then
-    "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' || {
-        echo "$python is older than 3.10    name another: make PYTHON=python3.11 ..." >&2; missing=1; }
+    "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
+        echo "$python is older than 3.11    name another: make PYTHON=python3.11 ..." >&2; missing=1; }
     "$python" -c 'import ensurepip, venv' 2>/dev/null || {
         echo "missing: the venv module of $python    install it with: apt-get install python3-venv" >&2; missing=1; }
 fi

@@ -107,6 +107,7 @@ pub fn save(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>
 pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
     let (manifest, digest) = load_manifest(dir)?;
     let config: ModelConfig = parse(&dir.join(CONFIG), &read(&dir.join(CONFIG), HEADER_BYTES_MAX)?, &manifest)?;
+    config.check().map_err(|reason| invalid(&dir.join(CONFIG), reason))?;
     let path = dir.join(WEIGHTS);
     let weights = read(&path, WEIGHT_BYTES_MAX)?;
     check_digest(&path, &weights, &manifest)?;
@@ -116,8 +117,9 @@ pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
     if let Some(name) = params.unused().first() {
         return Err(invalid(&path, format!("tensor {name} belongs to no network of {CONFIG}")));
     }
-    config.check().map_err(|reason| invalid(&dir.join(CONFIG), reason))?;
-    Ok(Agent::new(config, networks, digest))
+    let agent = Agent::new(config, networks, digest);
+    agent.open(0, &agent.config().sampler).map_err(|error| invalid(&dir.join(CONFIG), format!("sampler: {error}")))?;
+    Ok(agent)
 }
 
 /// Writes the checkpoint of `dir` into `out` with the same weights and origin and another configuration, e.g. other sampling defaults.

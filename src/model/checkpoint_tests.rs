@@ -116,4 +116,10 @@ fn other_versions_and_unknown_fields_are_refused() {
     let dir = copy();
     edit(dir.path(), |_, config| config["normalizer"]["state"]["std"][1] = 0.into());
     assert!(refusal(dir.path()).contains("scale is zero"));
+    let dir = copy();
+    edit(dir.path(), |_, config| config["sampler"]["action_horizon"] = 9.into());
+    assert!(refusal(dir.path()).contains("action_horizon"));
+    let dir = copy();
+    edit(dir.path(), |_, config| config["level_max"] = 4.into());
+    assert!(refusal(dir.path()).contains("level_max"));
 }

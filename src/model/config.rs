@@ -109,6 +109,7 @@ impl ModelConfig {
             ("normalizer.action", self.normalizer.action.dim(), action),
             ("normalizer.action.std", self.normalizer.action.std.len(), action),
             ("normalizer.reward", self.normalizer.reward.dim(), 1),
+            ("normalizer.reward.std", self.normalizer.reward.std.len(), 1),
             ("action_low", self.action_low.len(), action),
             ("action_high", self.action_high.len(), action),
         ];
@@ -116,14 +117,21 @@ impl ModelConfig {
             return Err(format!("{field} has {found} columns, expected {expected}"));
         }
         let scales = [&self.normalizer.state, &self.normalizer.action, &self.normalizer.reward];
-        if scales.iter().any(|affine| affine.std.iter().any(|std| !std.is_normal())) {
-            return Err("normalizer: a scale is zero or not finite".into());
+        if scales.iter().any(|affine| affine.std.iter().any(|std| !std.is_normal() || *std < 0.0)) {
+            return Err("normalizer: a scale is zero, negative or not finite".into());
+        }
+        if scales.iter().any(|affine| affine.mean.iter().any(|mean| !mean.is_finite())) {
+            return Err("normalizer: a mean is not finite".into());
+        }
+        let Restart { renoise_distance, cold_distance, latent_jump } = self.restart;
+        if [renoise_distance, cold_distance, latent_jump, self.latent_spread].iter().any(|value| value.is_nan() || *value < 0.0) {
+            return Err("restart and latent_spread must not be negative or NaN".into());
         }
         if self.action_low.iter().zip(&self.action_high).any(|(low, high)| low >= high || !low.is_finite() || !high.is_finite()) {
             return Err("action_low must be below action_high".into());
         }
-        if self.plan_horizon == 0 || self.obs_horizon == 0 || self.state_clip <= 0.0 {
-            return Err("plan_horizon, obs_horizon and state_clip must be positive".into());
+        if self.plan_horizon == 0 || self.obs_horizon == 0 || self.block_len == 0 || self.state_clip.is_nan() || self.state_clip <= 0.0 {
+            return Err("plan_horizon, obs_horizon, block_len and state_clip must be positive".into());
         }
         Ok(())
     }

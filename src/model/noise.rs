@@ -1,4 +1,4 @@
-//! Counter-based noise: the only randomness of the model (service rule: same seed, same observations, same bytes).
+//! Counter-based noise: the only randomness of the model (same seed, same observations, same bytes).
 //!
 //! A value of noise is a function of a key and a counter (Philox 4x32-10; Salmon et al. 2011, "Parallel random numbers: as easy as
 //! 1, 2, 3"), never of how many draws came before elsewhere. The sampler keys by (seed, absolute time, level, slot), so an act gives

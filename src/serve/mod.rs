@@ -90,16 +90,20 @@ impl Server {
         let faces = Faces { grpc, http: http::router(http::State { service: service.clone(), metrics: metrics.clone() }) };
         let leave = CancellationToken::new();
         let listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), leave.clone()));
-        let loaded = load(&service, config.clone()).await;
-        if loaded.is_ok() {
+        let serving = async {
+            load(&service, config.clone()).await?;
             grpc::report(&health, true).await;
             tracing::info!(address = %config.server.listen, "ready");
-            let housekeeping = housekeeping(&service, || metrics.run_upkeep());
-            tokio::select! {
-                () = shutdown => tracing::info!("draining"),
-                () = housekeeping => {}
+            housekeeping(&service, || metrics.run_upkeep()).await;
+            Ok(())
+        };
+        let served = tokio::select! {
+            () = shutdown => {
+                tracing::info!("draining");
+                Ok(())
             }
-        }
+            served = serving => served,
+        };
         grpc::report(&health, false).await;
         service.drain();
         sleep(Duration::from_millis(config.server.drain_notice_ms)).await;
@@ -112,7 +116,7 @@ impl Server {
             tracing::error!("the engine's end panicked");
         }
         tracing::info!("ended");
-        loaded
+        served
     }
 }
 

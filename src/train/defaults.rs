@@ -14,6 +14,9 @@ use serde_json::Value;
 /// # Errors
 /// If the checkpoint is refused, or a key or value is none of the model's.
 pub fn defaults(flags: &Defaults) -> Result<()> {
+    if flags.out == flags.checkpoint && flags.out.join("training").exists() {
+        bail!("{}: the next `run` would write the recipe's defaults again; name another directory", flags.out.display());
+    }
     let agent = load(&flags.checkpoint)?;
     let mut config = serde_json::to_value(agent.config())?;
     flags.overrides.iter().try_for_each(|text| set(&mut config, text))?;

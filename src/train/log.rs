@@ -34,10 +34,12 @@ impl Log {
     pub fn open(dir: &Path, position: &Position, clock: Box<Clock>) -> Result<Self> {
         fs::create_dir_all(dir).with_context(|| format!("cannot make {}", dir.display()))?;
         let path = dir.join("log.jsonl");
-        let kept: String = match fs::read_to_string(&path) {
-            Ok(text) => text.lines().filter(|line| is_before(line, position)).flat_map(|line| [line, "\n"]).collect(),
-            Err(_) => String::new(),
+        let text = match fs::read(&path) {
+            Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => String::new(),
+            Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
         };
+        let kept: String = text.lines().filter(|line| is_before(line, position)).flat_map(|line| [line, "\n"]).collect();
         fs::write(&path, kept).with_context(|| format!("cannot write {}", path.display()))?;
         let lines = OpenOptions::new().append(true).open(&path)?;
         let events = EventWriter::create(dir, position.step as u64, clock())?;

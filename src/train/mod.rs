@@ -20,7 +20,7 @@ pub mod tensorboard;
 mod tests;
 
 use crate::model::{config::ModelConfig, diffusion::refine::LatentRouting};
-use anyhow::{Result, bail, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use dataset::{Split, hdf5};
 use learner::{Learner, Scalars};
 use log::{Clock, Log};
@@ -29,6 +29,7 @@ use resume::{Identity, Stage, Store};
 use stage1::ElboTask;
 use stage2::RefineTask;
 use std::{
+    fs::{self, File},
     path::{Path, PathBuf},
     sync::{
         Arc,
@@ -114,6 +115,7 @@ impl Task {
 pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     let task = Task::new(recipe)?;
     let dir = options.out.join(TRAINING_DIR);
+    let _alone = lock(&dir)?;
     let store = Store::new(&dir, Identity { recipe: task.recipe.to_toml(), dataset: task.dataset_digest.clone() });
     let state = store.load()?;
     let resumed = state.as_ref().map(|state| state.position);
@@ -129,6 +131,14 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     }
     let mut crank = Crank { task: &task, store, log, out: &options.out, stop: options.stop, steps_left: options.stop_after_steps };
     crank.run(&mut learner)
+}
+
+/// Holds the directory for this process, as long as the file is open.
+fn lock(dir: &Path) -> Result<File> {
+    fs::create_dir_all(dir).with_context(|| format!("cannot make {}", dir.display()))?;
+    let file = File::create(dir.join("lock"))?;
+    file.try_lock().with_context(|| format!("{}: another run is at work here", dir.display()))?;
+    Ok(file)
 }
 
 /// Turns the crank: steps, logs, checkpoints.

@@ -269,6 +269,11 @@ impl Recipe {
         require(stage.elbo_weight >= 0.0, "stage2.elbo_weight", "must not be negative")?;
         require(stage.elbo_weight == 0.0 || self.stage1.is_some(), "stage2.elbo_weight", "must be 0 without stage1")?;
         require(stage.latent_lr_factor >= 0.0, "stage2.latent_lr_factor", "must not be negative")?;
+        let unrefined = self.model.latent.is_some() && stage.routing != LatentRouting::Matched;
+        let kappa = "must be 0: only stage2.routing = \"matched\" trains the refinement that it lets in";
+        require(!unrefined || self.sampler.kappa == 0.0, "sampler.kappa", kappa)?;
+        require((0.0..=1.0).contains(&self.sampler.eta), "sampler.eta", "must lie in 0..=1")?;
+        require((0.0..=10.0).contains(&self.sampler.temperature), "sampler.temperature", "must lie in 0..=10")?;
         check_rate("stage2.learning_rate", &stage.learning_rate)
     }
 }

@@ -1,6 +1,6 @@
 //! Stage 1: latent identification (section 4.2 of the paper), gated by the probe.
 //!
-//! Now and then a run codes the state change instead of the context, or loses one axis of it (algorithm: plain ELBO is not
+//! Now and then a run codes the state change instead of the context, or loses one axis of it (the ELBO is not
 //! identifying from every initialisation), so the probe decides whether it counts; if not, it starts anew from another seed.
 
 use super::{

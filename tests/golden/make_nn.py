@@ -1,7 +1,7 @@
 """Golden numbers for the layers of `src/model/nn`, from PyTorch: inputs, weights, results and gradients.
 
-    python -m venv /tmp/torch && /tmp/torch/bin/pip install torch numpy safetensors
-    /tmp/torch/bin/python tests/golden/make_nn.py
+    python -m venv target/torch && target/torch/bin/pip install torch numpy safetensors
+    target/torch/bin/python tests/golden/make_nn.py
 
 Writes `nn.safetensors` beside this file. Computed in float64 and rounded once. Activations are channels last; gradients are those
 of `sum(y * r)`. Tensor names: `<case>.x`, `.h0`, `.y`, `.r`, `.p.<parameter>`, `.dx`, `.dh0`, `.dp.<parameter>`.

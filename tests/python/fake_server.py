@@ -1,4 +1,4 @@
-"""A double of the server for faults that a real one shows only by chance: the step protocol (R1, R2) and both faces, small.
+"""A double of the server for faults that a real one shows only by chance: the step protocol and both faces, small.
 
 An act's actions are `step + executed rewards`, so a test sees what arrived. Faults are scripted: each act takes the next one.
 """

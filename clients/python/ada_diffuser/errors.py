@@ -110,7 +110,7 @@ class Unavailable(AdaError):
 
 
 class Cancelled(AdaError):
-    """The session was closed under the act. CANCELLED."""
+    """The call was given up on this side before it was answered. CANCELLED."""
 
 
 class ServerFault(AdaError):

@@ -225,7 +225,8 @@ impl Descent {
         let jump = walk.process.jump(from, to, options.eta);
         let mut noise = vec![0.0; x0.len()];
         if jump.noise > 0.0 {
-            self.noise().fill(self.time() + position as u64, levels[1] as u32, Slot::Jump, &mut noise);
+            // The position joins the level, as in `renoise`: a later act may walk the same levels again.
+            self.noise().fill(self.time() + position as u64, (levels[1] | position << 16) as u32, Slot::Jump, &mut noise);
         }
         let scale = jump.noise * options.temperature;
         let x = &mut self.x[position * x0.len()..][..x0.len()];

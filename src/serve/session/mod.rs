@@ -1,4 +1,4 @@
-//! One session: an episode as a value, the last committed answer, and at most one act in flight. The step protocol (R1, R2) stands here.
+//! One session: an episode as a value, the last committed answer, and at most one act in flight. The step protocol stands here: same step, same answer.
 
 mod flight;
 mod table;
@@ -180,10 +180,14 @@ impl Session {
             let busy = slot.flight.as_ref().is_some_and(|flight| flight.is_wanted());
             return Err(if busy { ServiceError::SessionBusy { committed } } else { ServiceError::StepOutOfOrder { step, committed } });
         }
-        if let Some(flight) = &slot.flight
-            && let Some(waiter) = Waiter::join(self, flight)
-        {
-            return if flight.key == key { Ok(Entry::Join(waiter)) } else { Err(ServiceError::StepPayloadMismatch { step, committed }) };
+        // The keys are compared before anyone joins: a waiter that was dropped here would lock the slot once more, from this thread.
+        if let Some(flight) = slot.flight.as_ref().filter(|flight| flight.is_wanted()) {
+            if flight.key != key {
+                return Err(ServiceError::StepPayloadMismatch { step, committed });
+            }
+            if let Some(waiter) = Waiter::join(self, flight) {
+                return Ok(Entry::Join(waiter));
+            }
         }
         let waiter = Waiter::lead(self, Flight::new(step, key, now));
         slot.flight = Some(waiter.flight().clone());

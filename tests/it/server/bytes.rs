@@ -1,4 +1,4 @@
-//! R3: the same seed and the same observations give the same bytes, whoever asks, over whichever face, in whatever company, before and after a restart.
+//! The same seed and the same observations give the same bytes, whoever asks, over whichever face, in whatever company, before and after a restart.
 
 use super::*;
 
