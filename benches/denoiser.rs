@@ -8,12 +8,11 @@ use ada_diffuser::model::{
     config::{ModelConfig, Restart},
     denoiser::{Condition, DenoiserConfig},
     diffusion::refine::{LatentRouting, RefineOptions, WindowBatch},
-    latent::LatentConfig,
-    nn::params::Params,
+    latent::{LatentConfig, Tokens},
+    nn::{Buffer, Params, Value},
     noise::Philox,
-    trajectory::{Layout, Token, Tokens},
+    trajectory::{Layout, TokenRef},
 };
-use candle_core::{Device, Tensor};
 use criterion::{Criterion, criterion_group, criterion_main};
 use std::hint::black_box;
 
@@ -43,10 +42,9 @@ fn frozen(config: &ModelConfig) -> Networks {
     Networks::new(config, &Params::loaded(tensors)).expect("same names")
 }
 
-fn random(shape: (usize, usize, usize)) -> Tensor {
+fn random<V: Value>(shape: [usize; 3]) -> V {
     let mut stream = Philox::new(1);
-    let values: Vec<f32> = (0..shape.0 * shape.1 * shape.2).map(|_| stream.normal()).collect();
-    Tensor::from_vec(values, shape, &Device::Cpu).expect("count fits")
+    V::generate(shape, |out| out.iter_mut().for_each(|value| *value = stream.normal())).expect("count fits")
 }
 
 fn forward(c: &mut Criterion) {
@@ -54,8 +52,8 @@ fn forward(c: &mut Criterion) {
         let config = config(net);
         let networks = frozen(&config);
         for batch in [1, 32] {
-            let (x, latents) = (random((batch, T, STATE + ACTION)), random((batch, T, 20)));
-            let levels = random((batch, T, 1)).squeeze(2).expect("squeezes").affine(10.0, 75.0).expect("scales");
+            let (x, latents): (Buffer, Buffer) = (random([batch, T, STATE + ACTION]), random([batch, T, 20]));
+            let levels: Vec<f32> = (0..batch * T).map(|i| (i * 7 % 150) as f32).collect();
             let condition = Condition { levels: &levels, latents: Some(&latents), observed: None };
             c.bench_function(&format!("forward/{name}/batch-{batch}"), |b| {
                 b.iter(|| black_box(networks.denoiser.predict(&x, &condition).expect("predicts")))
@@ -84,15 +82,14 @@ fn train_step(c: &mut Criterion) {
         let config = config(net);
         let params = Params::fresh(0);
         let networks = Networks::new(&config, &params).expect("sizes fit");
-        let history =
-            vec![vec![Token { state: Some(vec![0.1; STATE]), action: Some(vec![0.1; ACTION]), reward: Some(0.1), noise: 0.0 }; 10]; 64];
+        let token = TokenRef { state: Some(&[0.1; STATE]), action: Some(&[0.1; ACTION]), reward: Some(0.1), noise: 0.0 };
         let batch = WindowBatch {
-            history: Tokens::pack(config.layout, &history).expect("packs"),
-            window: random((batch_size, T, STATE + ACTION)),
+            history: Tokens::pack(config.layout, 0..batch_size, 10, |_, _| token).expect("packs"),
+            window: random([batch_size, T, STATE + ACTION]),
             observed: None,
             rows: (0..batch_size).map(|i| i % T).collect(),
             inpaint: vec![true; batch_size],
-            noise: random((batch_size, T, STATE + ACTION)),
+            noise: random([batch_size, T, STATE + ACTION]),
         };
         let options = RefineOptions { routing: LatentRouting::Matched, first_action_weight: 10.0, sub_steps: 1 };
         c.bench_function(&format!("train-step/{name}/batch-{batch_size}"), |b| {

@@ -6,7 +6,6 @@ use ada_diffuser::model::nn::kernels::{
     attention::Attention,
     convolution::{ConvShape, Convolution},
     norm::{self, Norm},
-    product::Packed,
 };
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;
@@ -21,14 +20,15 @@ fn values(count: usize) -> Vec<f32> {
 fn convolution(c: &mut Criterion) {
     let shape = ConvShape { c_in: 64, c_out: 64, kernel: 5, stride: 1, padding: 2 };
     let weight = values(64 * 64 * 5);
-    let (forward, back): (Packed, Packed) = (shape.pack_gather(&weight), shape.pack_spread(&weight));
+    let (forward, back) = (shape.pack_gather(&weight), shape.pack_spread(&weight));
     let mut group = c.benchmark_group("convolution");
     for batch in BATCHES {
         let plan = Convolution { shape, batch, wide_steps: 8, narrow_steps: 8 };
         let (x, dy) = (values(batch * 8 * 64), values(batch * 8 * 64));
+        let mut out = x.clone();
         group.throughput(Throughput::Elements(2 * (batch * 8 * 64 * 64 * 5) as u64));
-        group.bench_function(format!("forward, batch {batch}"), |b| b.iter(|| plan.gather(black_box(&x), &forward, None)));
-        group.bench_function(format!("input gradient, batch {batch}"), |b| b.iter(|| plan.spread(black_box(&dy), &back, None)));
+        group.bench_function(format!("forward, batch {batch}"), |b| b.iter(|| plan.gather(black_box(&x), &forward, None, &mut out)));
+        group.bench_function(format!("input gradient, batch {batch}"), |b| b.iter(|| plan.spread(black_box(&dy), &back, None, &mut out)));
         group.bench_function(format!("weight gradient, batch {batch}"), |b| b.iter(|| plan.weight_grad(black_box(&x), &dy)));
     }
     group.throughput(Throughput::Elements(weight.len() as u64));
@@ -45,8 +45,7 @@ fn normalisation(c: &mut Criterion) {
         let x = values(batch * 8 * 64);
         let mut out = x.clone();
         group.throughput(Throughput::Elements(x.len() as u64));
-        group
-            .bench_function(format!("forward, batch {batch}"), |b| b.iter(|| norm::forward(norm, black_box(&x), &weight, &bias, &mut out)));
+        group.bench_function(format!("forward, batch {batch}"), |b| b.iter(|| norm::in_place(norm, black_box(&mut out), &weight, &bias)));
         group.bench_function(format!("backward, batch {batch}"), |b| b.iter(|| norm::backward(norm, black_box(&x), (&weight, &bias), &x)));
     }
     group.finish();
@@ -54,11 +53,10 @@ fn normalisation(c: &mut Criterion) {
 
 fn elementwise(c: &mut Criterion) {
     let mut group = c.benchmark_group("activation");
-    let x = values(1 << 14);
-    let mut out = x.clone();
-    group.throughput(Throughput::Elements(x.len() as u64));
+    let mut out = values(1 << 14);
+    group.throughput(Throughput::Elements(out.len() as u64));
     for kind in [Activation::Mish, Activation::Silu, Activation::GeluTanh, Activation::Relu] {
-        group.bench_function(format!("{kind:?}"), |b| b.iter(|| activation::forward(kind, black_box(&x), &mut out)));
+        group.bench_function(format!("{kind:?}"), |b| b.iter(|| activation::in_place(kind, black_box(&mut out))));
     }
     group.finish();
 }
@@ -67,7 +65,8 @@ fn elementwise(c: &mut Criterion) {
 fn attention(c: &mut Criterion) {
     let mut group = c.benchmark_group("attention");
     let (plan, qkv, grad) = (Attention { batch: 1, steps: 42, heads: 8, head_dim: 32 }, values(42 * 768), values(42 * 256));
-    group.bench_function("forward", |b| b.iter(|| plan.forward(black_box(&qkv))));
+    let mut out = grad.clone();
+    group.bench_function("forward", |b| b.iter(|| plan.forward(black_box(&qkv), &mut out)));
     group.bench_function("backward", |b| b.iter(|| plan.backward(black_box(&qkv), &grad)));
     group.finish();
 }

@@ -66,7 +66,7 @@ pub fn latent_means(latent: &LatentModel, episodes: &[Episode], places: &[Place]
         let len = block_len + if evidence == Evidence::Filter { 1 } else { 2 };
         let posterior = latent.infer(&rows.tokens(len)?)?;
         let gaussian = if evidence == Evidence::Filter { latent.prior.predict(&posterior)? } else { posterior };
-        out.width = gaussian.mean.dim(1)?;
+        out.width = gaussian.mean.dim(candle_core::D::Minus1)?;
         out.values.extend(gaussian.mean.flatten_all()?.to_vec1::<f32>()?.into_iter().map(f64::from));
     }
     Ok(out)

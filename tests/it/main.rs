@@ -3,6 +3,7 @@
 // A test that panics has failed, which is what an unwrap here is for.
 #![allow(clippy::unwrap_used)]
 
+mod allocations;
 mod laws;
 mod server;
 mod trainer;

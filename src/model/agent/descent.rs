@@ -1,69 +1,122 @@
 //! An act in progress: a window on its way down the ladder, one row an evaluation (sections 4.3 and 4.4 of the paper).
 
-use super::{
-    AgentError, Chunk, Episode, LatentMode, Start,
-    episode::{Planned, Window},
-};
+use super::{AgentError, Chunk, Episode, LatentMode, Start, episode::Planned, episode::Window};
 use crate::model::{
     config::ModelConfig,
     diffusion::{ladder::Ladder, process::Process},
-    latent::PlainGaussian,
+    latent::GaussianRef,
     noise::{Noise, Slot},
-    trajectory::Token,
+    trajectory::TokenRef,
 };
 use std::ops::Range;
 
-/// An act in progress. It works on a copy of the episode: dropping it leaves the old one standing.
+/// An act in progress. It works on a copy of the episode: dropping it leaves the old one standing. All its memory is taken when it
+/// begins; going down allocates nothing.
 #[derive(Debug)]
 pub struct Descent {
     pub(super) episode: Episode,
     /// s_tau, normalized.
     pub(super) state: Vec<f32>,
+    pub(super) ladder: Ladder,
     /// Whether the stored window begins at this time.
     aligned: bool,
-    /// `T * D` values; empty until the window has started.
+    started: bool,
+    /// `T * D` values.
     pub(super) x: Vec<f32>,
-    /// The network's last estimate of the clean window.
+    /// The network's last estimate of the clean window, `T * D` values; its position 0 is that of `x` before it was dropped.
     x0: Vec<f32>,
     /// Row of the ladder.
     pub(super) row: usize,
-    /// Distribution of the latent at each position, `T + action_horizon - 1` at first; empty for a model without latents.
-    pub(super) chain: Vec<PlainGaussian>,
+    pub(super) chain: Chain,
     /// Mean of the prior latent of position 0 at the last cold start.
     anchor: Vec<f32>,
-    /// Real tokens and, after the first action of a chunk, imagined ones, which do not outlive the act.
-    pub(super) block: Vec<Token>,
-    actions: Vec<Vec<f32>>,
+    /// Positions given out, `D` values each; the tokens that latents of later positions look back on, and which do not outlive the act.
+    emitted: Vec<f32>,
     predicted_state: Vec<f32>,
-    first_latent: Option<PlainGaussian>,
+    /// Noise of one position.
+    eps: Vec<f32>,
     evaluations: u32,
+    /// Evaluations that it may still take.
+    allowance: Option<usize>,
+    degraded: bool,
     start: Start,
     failed: bool,
 }
 
-/// The tables that a descent walks; one for all rows of a forward with the same sub-steps.
+/// Distributions of the latents from the act's first position on, `T + action_horizon - 1` of them; without any for a model without
+/// latents.
+#[derive(Debug)]
+pub(super) struct Chain {
+    mean: Vec<f32>,
+    log_var: Vec<f32>,
+    dim: usize,
+    /// Which one belongs to position 0 of the window.
+    first: usize,
+}
+
+impl Chain {
+    fn new(len: usize, dim: usize) -> Self {
+        Self { mean: vec![0.0; len * dim], log_var: vec![0.0; len * dim], dim, first: 0 }
+    }
+
+    /// How many belong to position 0 and those behind it.
+    pub(super) fn len(&self) -> usize {
+        self.mean.len().checked_div(self.dim).map_or(0, |len| len - self.first)
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    fn range(&self, position: usize) -> Range<usize> {
+        let at = (self.first + position) * self.dim;
+        at..at + self.dim
+    }
+
+    /// The latent of a position of the window.
+    pub(super) fn get(&self, position: usize) -> GaussianRef<'_> {
+        let range = self.range(position);
+        GaussianRef { mean: &self.mean[range.clone()], log_var: &self.log_var[range] }
+    }
+
+    /// Replaces it; positions beyond the last are not kept.
+    pub(super) fn set(&mut self, position: usize, latent: GaussianRef) {
+        if position < self.len() {
+            let range = self.range(position);
+            self.mean[range.clone()].copy_from_slice(latent.mean);
+            self.log_var[range].copy_from_slice(latent.log_var);
+        }
+    }
+}
+
+/// The tables that a descent walks.
+#[derive(Clone, Copy)]
 pub(super) struct Walk<'a> {
     pub(super) config: &'a ModelConfig,
     pub(super) process: &'a Process,
-    pub(super) ladder: Ladder,
 }
 
 impl Descent {
-    pub(super) fn new(episode: Episode, state: Vec<f32>, aligned: bool) -> Self {
+    pub(super) fn new(episode: Episode, state: Vec<f32>, ladder: Ladder, aligned: bool, config: &ModelConfig) -> Self {
+        let (dim, len, actions) = (config.layout.dim(), config.plan_horizon, episode.options.action_horizon);
+        let latent_dim = config.latent.as_ref().map_or(0, |latent| latent.dim);
         Self {
-            block: episode.history.iter().cloned().collect(),
             episode,
             state,
+            ladder,
             aligned,
-            x: Vec::new(),
-            x0: Vec::new(),
+            started: false,
+            x: vec![0.0; len * dim],
+            x0: vec![0.0; len * dim],
             row: 0,
-            chain: Vec::new(),
-            anchor: Vec::new(),
-            actions: Vec::new(),
-            predicted_state: Vec::new(),
-            first_latent: None,
+            chain: Chain::new(len + actions - 1, latent_dim),
+            anchor: vec![0.0; latent_dim],
+            emitted: Vec::with_capacity(actions * dim),
+            predicted_state: vec![0.0; config.layout.state_dim],
+            eps: vec![0.0; dim],
             evaluations: 0,
+            allowance: None,
+            degraded: false,
             start: Start::Cold,
             failed: false,
         }
@@ -71,7 +124,7 @@ impl Descent {
 
     /// Whether the chunk is ready to be taken by [`super::Agent::finish`].
     pub fn is_done(&self) -> bool {
-        self.failed || self.actions.len() == self.episode.options.action_horizon
+        self.failed || self.actions_left() == 0
     }
 
     /// Network evaluations spent so far.
@@ -79,8 +132,54 @@ impl Descent {
         self.evaluations
     }
 
+    /// Bounds the evaluations that it may still take, at least one: if the ladder asks for more, the coming rows are taken in larger
+    /// jumps, and the chunk is marked degraded. Rows are those of training, whatever the jump, so each estimate is as good as ever; only
+    /// the walk between them gets coarser. `None` lifts the bound.
+    pub fn allow(&mut self, evaluations: Option<usize>) {
+        self.allowance = evaluations.map(|evaluations| evaluations.max(1));
+    }
+
+    /// Gives out what there is, without another evaluation: positions of the last estimate or, if there is none yet, of the stored
+    /// window as it is. Says whether there was anything; if so, the descent is done, and marked degraded.
+    pub(super) fn cut_short(&mut self, walk: Walk) -> bool {
+        if !self.started {
+            if self.stored_start(walk.config).is_none_or(|start| start == Start::Cold) {
+                return false;
+            }
+            self.start(walk);
+        } else if self.evaluations == 0 {
+            return false;
+        }
+        self.degraded = true;
+        while !self.is_done() {
+            if self.evaluations > 0 {
+                let rows = self.ladder.emit() - self.row;
+                self.jump_rows(rows, walk);
+                self.emit(walk);
+            } else {
+                self.emit(walk);
+                // Nothing went down: what was at rung 2 is at position 0 now.
+                self.row = self.row.saturating_sub(self.ladder.rung());
+            }
+        }
+        true
+    }
+
     pub(super) fn has_started(&self) -> bool {
-        !self.x.is_empty()
+        self.started
+    }
+
+    fn action_horizon(&self) -> usize {
+        self.episode.options.action_horizon
+    }
+
+    /// Positions given out.
+    pub(super) fn emitted(&self) -> usize {
+        self.emitted.len() / self.eps.len().max(1)
+    }
+
+    fn actions_left(&self) -> usize {
+        self.action_horizon() - self.emitted()
     }
 
     fn noise(&self) -> Noise {
@@ -89,197 +188,237 @@ impl Descent {
 
     /// Environment time of position 0.
     fn time(&self) -> u64 {
-        self.episode.time + self.actions.len() as u64
+        self.episode.time + self.emitted() as u64
     }
 
     /// Chooses between the stored window and a cold start, and fills the window (the stored one was built for
     /// a predicted state and an older latent; a little surprise is noised away, a great one or a jump of the latent starts anew).
-    pub(super) fn start(&mut self, walk: &Walk) {
-        let stored = self.episode.window.take().filter(|_| self.aligned && self.episode.options.streaming);
-        self.start = stored.as_ref().map_or(Start::Cold, |window| self.choose_start(window, walk.config));
-        match (stored, self.start) {
-            (Some(window), Start::Warm) => self.resume(window, walk.ladder.ready()),
+    pub(super) fn start(&mut self, walk: Walk) {
+        self.started = true;
+        self.start = self.stored_start(walk.config).unwrap_or(Start::Cold);
+        match (self.episode.window.take(), self.start) {
+            (Some(window), Start::Warm) => self.resume(&window, window.row),
             (Some(window), Start::Renoised(rungs)) => {
-                let row = walk.ladder.ready() - rungs as usize * self.episode.options.sub_steps;
-                self.resume(window, row);
-                self.renoise(walk);
+                let row = window.row.saturating_sub(rungs as usize * self.ladder.rung());
+                self.resume(&window, row);
+                self.renoise(window.row, walk);
             }
             (None, _) | (_, Start::Cold) => {
                 self.row = 0;
-                self.anchor = self.chain.first().map_or_else(Vec::new, |latent| latent.mean.clone());
-                self.x = Vec::new();
-                (0..walk.config.plan_horizon).for_each(|position| self.append_noise(position, walk.config.layout.dim()));
+                if !self.chain.is_empty() {
+                    self.anchor.copy_from_slice(self.chain.get(0).mean);
+                }
+                (0..walk.config.plan_horizon).for_each(|position| self.draw_position(position));
             }
         }
         self.inpaint();
     }
 
-    fn choose_start(&self, window: &Window, config: &ModelConfig) -> Start {
+    /// How the act would start from the stored window, if there is one for this time.
+    fn stored_start(&self, config: &ModelConfig) -> Option<Start> {
+        let window = self.episode.window.as_ref().filter(|_| self.aligned && self.episode.options.streaming)?;
         let restart = &config.restart;
         let distance = rms(&self.state, &window.predicted_state);
-        let moved =
-            self.chain.first().map_or(0.0, |latent| norm(&latent.mean, &window.anchor) / config.latent_spread.max(f32::MIN_POSITIVE));
+        let moved = if self.chain.is_empty() { 0.0 } else { norm(self.chain.get(0).mean, &window.anchor) };
         let rungs = (config.plan_horizon / 4).clamp(1, config.plan_horizon.saturating_sub(1).max(1));
-        if distance >= restart.cold_distance || moved > restart.latent_jump {
+        Some(if distance >= restart.cold_distance || moved / config.latent_spread.max(f32::MIN_POSITIVE) > restart.latent_jump {
             Start::Cold
         } else if distance >= restart.renoise_distance && config.plan_horizon > 1 {
             Start::Renoised(rungs as u32)
         } else {
             Start::Warm
-        }
+        })
     }
 
-    fn resume(&mut self, window: Window, row: usize) {
-        (self.x, self.anchor, self.row) = (window.x, window.anchor, row);
+    fn resume(&mut self, window: &Window, row: usize) {
+        self.x.copy_from_slice(&window.x);
+        self.anchor.copy_from_slice(&window.anchor);
+        self.row = row;
     }
 
-    /// Forward jump of every position from READY up to the current row.
-    fn renoise(&mut self, walk: &Walk) {
-        let (dim, ready) = (walk.config.layout.dim(), walk.ladder.ready());
+    /// Forward jump of every position from row `from` up to the current one.
+    fn renoise(&mut self, from: usize, walk: Walk) {
+        let (dim, temperature) = (self.eps.len(), self.episode.options.temperature);
         for position in 0..walk.config.plan_horizon {
-            let (from, to) = (walk.ladder.fine(ready, position), walk.ladder.fine(self.row, position));
-            let (keep, add) = walk.process.renoise(walk.ladder.level(from), walk.ladder.level(to));
-            let mut eps = vec![0.0; dim];
+            let [from, to] = [from, self.row].map(|row| self.ladder.fine(row, position));
+            let (keep, add) = walk.process.renoise(self.ladder.level(from), self.ladder.level(to));
             // The act's own offset joins the level: a position may be noised to the same level again at a later act.
-            self.noise().fill(self.time() + position as u64, (to | position << 16) as u32, Slot::Renoise, &mut eps);
-            let add = add * self.episode.options.temperature;
-            self.x[position * dim..][..dim].iter_mut().zip(eps).for_each(|(x, eps)| *x = keep * *x + add * eps);
+            let (noise, time) = (self.noise(), self.time() + position as u64);
+            noise.fill(time, (to | position << 16) as u32, Slot::Renoise, &mut self.eps);
+            let add = add * temperature;
+            self.x[position * dim..][..dim].iter_mut().zip(&self.eps).for_each(|(x, eps)| *x = keep * *x + add * eps);
         }
     }
 
-    fn append_noise(&mut self, position: usize, dim: usize) {
-        let mut eps = vec![0.0; dim];
-        self.noise().fill(self.time() + position as u64, u32::MAX, Slot::Window, &mut eps);
-        let temperature = self.episode.options.temperature;
-        self.x.extend(eps.into_iter().map(|eps| temperature * eps));
+    /// A new position of the window, at pure noise.
+    fn draw_position(&mut self, position: usize) {
+        let (dim, temperature) = (self.eps.len(), self.episode.options.temperature);
+        let (noise, time) = (self.noise(), self.time() + position as u64);
+        let x = &mut self.x[position * dim..][..dim];
+        noise.fill(time, u32::MAX, Slot::Window, x);
+        x.iter_mut().for_each(|x| *x *= temperature);
     }
 
     /// Position 0 of the first action holds the real state; later ones hold what the model imagines.
     fn inpaint(&mut self) {
-        if self.actions.is_empty() {
+        if self.emitted.is_empty() {
             self.x[..self.state.len()].copy_from_slice(&self.state);
         }
     }
 
-    /// Takes the distribution of every latent from position 0 on.
-    pub(super) fn set_chain(&mut self, chain: Vec<PlainGaussian>) {
-        self.chain = chain;
-    }
-
     /// Whether position 0 is to be refined before the next evaluation.
-    pub(super) fn wants_refinement(&self, ladder: &Ladder) -> bool {
-        self.row == ladder.ready() && self.episode.options.kappa > 0.0 && !self.chain.is_empty()
+    pub(super) fn wants_refinement(&self) -> bool {
+        self.row == self.ladder.ready() && self.episode.options.kappa > 0.0 && !self.chain.is_empty()
     }
 
-    /// Latents of the window, `T * latent_dim` values: means, or draws by the noise of each position's absolute time.
-    pub(super) fn latents(&self, horizon: usize) -> Vec<f32> {
-        let positions = self.chain.iter().take(horizon).enumerate();
-        let draw = |(position, latent): (usize, &PlainGaussian)| match self.episode.options.latent {
-            LatentMode::Mean => latent.mean.clone(),
-            LatentMode::Sample => {
-                let mut eps = vec![0.0; latent.mean.len()];
-                self.noise().fill(self.time() + position as u64, 0, Slot::Latent, &mut eps);
-                latent.mean.iter().zip(&latent.log_var).zip(eps).map(|((mean, log_var), eps)| mean + (log_var / 2.0).exp() * eps).collect()
+    /// Writes the latents of the window, `T * latent_dim` values: means, or draws by the noise of each position's absolute time.
+    pub(super) fn write_latents(&self, out: &mut [f32]) {
+        for (position, out) in out.chunks_exact_mut(self.chain.dim.max(1)).enumerate() {
+            let latent = self.chain.get(position);
+            match self.episode.options.latent {
+                LatentMode::Mean => out.copy_from_slice(latent.mean),
+                LatentMode::Sample => {
+                    self.noise().fill(self.time() + position as u64, 0, Slot::Latent, out);
+                    let columns = out.iter_mut().zip(latent.mean.iter().zip(latent.log_var));
+                    columns.for_each(|(out, (mean, log_var))| *out = mean + (log_var / 2.0).exp() * *out);
+                }
             }
-        };
-        positions.flat_map(draw).collect()
+        }
+    }
+
+    /// Levels of the window, one a position.
+    pub(super) fn write_levels(&self, out: &mut [f32]) {
+        for (position, out) in out.iter_mut().enumerate() {
+            *out = self.ladder.level(self.ladder.fine(self.row, position)) as f32;
+        }
+    }
+
+    /// Number of tokens before position 0: real ones and, after the first action of a chunk, imagined ones.
+    pub(super) fn past(&self) -> usize {
+        self.episode.history.len() + self.emitted()
+    }
+
+    /// Token `index` of the past, oldest first.
+    pub(super) fn past_token(&self, index: usize, walk: Walk) -> TokenRef<'_> {
+        match self.episode.history.get(index) {
+            Some(token) => token.view(),
+            None => {
+                let dim = self.eps.len();
+                let position = &self.emitted[(index - self.episode.history.len()) * dim..][..dim];
+                let (state, action) = position.split_at(walk.config.layout.state_dim);
+                TokenRef { state: Some(state), action: Some(action), ..TokenRef::default() }
+            }
+        }
+    }
+
+    /// The current state as a token: what the filter has of x_tau.
+    pub(super) fn current_token(&self) -> TokenRef<'_> {
+        TokenRef { state: Some(&self.state), ..TokenRef::default() }
     }
 
     /// Token of a noised position, for the refinement; the reward is never generated.
-    pub(super) fn noisy_token(&self, position: usize, walk: &Walk) -> Token {
+    pub(super) fn noisy_token(&self, position: usize, walk: Walk) -> TokenRef<'_> {
         let layout = walk.config.layout;
-        let x = &self.x[position * layout.dim()..][..layout.dim()];
-        let level = walk.ladder.level(walk.ladder.fine(self.row, position));
-        let (state, action) = x.split_at(layout.state_dim);
-        Token { state: Some(state.to_vec()), action: Some(action.to_vec()), reward: None, noise: walk.process.sigma(level) }
+        let (state, action) = self.x[position * layout.dim()..][..layout.dim()].split_at(layout.state_dim);
+        let noise = walk.process.sigma(self.ladder.level(self.ladder.fine(self.row, position)));
+        TokenRef { state: Some(state), action: Some(action), reward: None, noise }
     }
 
-    /// Takes the network's estimate of the clean window and goes one row down.
-    pub(super) fn step_down(&mut self, mut x0: Vec<f32>, walk: &Walk) {
+    /// Takes the network's estimate of the clean window and goes down: one row, or as many as the allowance asks for.
+    pub(super) fn step_down(&mut self, x0: &[f32], walk: Walk) {
         self.evaluations += 1;
         if x0.iter().any(|value| !value.is_finite()) {
             self.failed = true;
             return;
         }
-        let dim = walk.config.layout.dim();
-        x0.chunks_mut(dim).for_each(|position| walk.config.clip(position));
-        for position in 0..walk.config.plan_horizon {
-            self.jump(position, &x0[position * dim..][..dim], walk);
-        }
-        self.x0 = x0;
-        self.row += 1;
+        self.x0.copy_from_slice(x0);
+        self.x0.chunks_mut(walk.config.layout.dim()).for_each(|position| walk.config.clip(position));
+        let rows = self.rows_at_once();
+        self.degraded |= rows > 1;
+        self.allowance = self.allowance.map(|left| left.saturating_sub(1).max(1));
+        self.jump_rows(rows, walk);
         self.inpaint();
-        if self.row == walk.ladder.emit() {
+        if self.row == self.ladder.emit() {
             self.emit(walk);
         }
     }
 
-    /// Reverse jump of one position to its level in the next row.
-    fn jump(&mut self, position: usize, x0: &[f32], walk: &Walk) {
-        let levels = [self.row, self.row + 1].map(|row| walk.ladder.fine(row, position));
-        let [from, to] = levels.map(|fine| walk.ladder.level(fine));
+    /// Rows to the next evaluation; never beyond the one where position 0 comes clean.
+    fn rows_at_once(&self) -> usize {
+        let left = self.ladder.emit() - self.row;
+        let Some(allowance) = self.allowance else { return 1 };
+        // The least jump with which this position and those behind it come clean in time.
+        let needed = |rows: usize| left.div_ceil(rows) + (self.actions_left() - 1) * self.ladder.rung().div_ceil(rows);
+        (1..left).find(|&rows| needed(rows) <= allowance).unwrap_or(left)
+    }
+
+    /// Reverse jump of every position, by the last estimate, to its level so many rows below.
+    fn jump_rows(&mut self, rows: usize, walk: Walk) {
+        (0..walk.config.plan_horizon).for_each(|position| self.jump(position, rows, walk));
+        self.row += rows;
+    }
+
+    fn jump(&mut self, position: usize, rows: usize, walk: Walk) {
+        let levels = [self.row, self.row + rows].map(|row| self.ladder.fine(row, position));
+        let [from, to] = levels.map(|fine| self.ladder.level(fine));
         if from == to {
             return;
         }
-        let options = &self.episode.options;
+        let (dim, options) = (self.eps.len(), &self.episode.options);
         let jump = walk.process.jump(from, to, options.eta);
-        let mut noise = vec![0.0; x0.len()];
+        let scale = jump.noise * options.temperature;
         if jump.noise > 0.0 {
             // The position joins the level, as in `renoise`: a later act may walk the same levels again.
-            self.noise().fill(self.time() + position as u64, (levels[1] | position << 16) as u32, Slot::Jump, &mut noise);
+            let (noise, time) = (self.noise(), self.time() + position as u64);
+            noise.fill(time, (levels[1] | position << 16) as u32, Slot::Jump, &mut self.eps);
+        } else {
+            self.eps.fill(0.0);
         }
-        let scale = jump.noise * options.temperature;
-        let x = &mut self.x[position * x0.len()..][..x0.len()];
-        for ((x, x0), noise) in x.iter_mut().zip(x0).zip(noise) {
+        let place = position * dim..(position + 1) * dim;
+        for ((x, x0), noise) in self.x[place.clone()].iter_mut().zip(&self.x0[place]).zip(&self.eps) {
             *x = jump.x0 * x0 + jump.eps * walk.process.eps(from, *x, *x0) + scale * noise;
         }
     }
 
     /// Position 0 is clean: give its action out, drop it, and let a fresh position in at the far end.
-    fn emit(&mut self, walk: &Walk) {
-        let layout = walk.config.layout;
-        let rest = self.x.split_off(layout.dim());
-        let emitted = std::mem::replace(&mut self.x, rest);
-        let (state, action) = emitted.split_at(layout.state_dim);
-        self.predicted_state = self.x0.get(Self::next_state(walk.config)).unwrap_or(state).to_vec();
-        if self.first_latent.is_none() {
-            self.first_latent = self.chain.first().cloned();
-        }
+    fn emit(&mut self, walk: Walk) {
+        let (dim, state_dim, last) = (self.eps.len(), walk.config.layout.state_dim, walk.config.plan_horizon - 1);
+        self.emitted.extend_from_slice(&self.x[..dim]);
+        // What comes next: the estimate of position 1, or what stands there if nothing was estimated in this act.
+        let next = if self.evaluations > 0 { &self.x0 } else { &self.x };
+        self.predicted_state.copy_from_slice(next.get(dim..dim + state_dim).unwrap_or(&self.x[..state_dim]));
         if !self.chain.is_empty() {
-            self.chain.remove(0);
+            self.chain.first += 1;
         }
-        self.block.push(Token { state: Some(state.to_vec()), action: Some(action.to_vec()), reward: None, noise: 0.0 });
-        self.actions.push(action.to_vec());
-        self.append_noise(walk.config.plan_horizon - 1, layout.dim());
-        self.row = walk.ladder.ready();
-    }
-
-    fn next_state(config: &ModelConfig) -> Range<usize> {
-        config.layout.dim()..config.layout.dim() + config.layout.state_dim
+        self.x.copy_within(dim.., 0);
+        self.draw_position(last);
+        self.row = self.ladder.ready();
     }
 
     pub(super) fn finish(self, config: &ModelConfig) -> Result<(Episode, Chunk), AgentError> {
         if self.failed {
             return Err(AgentError::NonFinite);
         }
-        let (normalizer, dim) = (&config.normalizer, config.layout.dim());
-        let latent = self.first_latent.clone().unwrap_or_default();
-        let planned_states = self.x0.chunks(dim).map(|row| normalizer.state.denormalize(&row[..config.layout.state_dim]));
+        let (normalizer, layout) = (&config.normalizer, config.layout);
+        let actions: Vec<Vec<f32>> = self.emitted.chunks(layout.dim()).map(|position| position[layout.state_dim..].to_vec()).collect();
+        let planned = if self.evaluations > 0 { &self.x0 } else { &self.x };
+        let planned_states = planned.chunks(layout.dim()).map(|row| normalizer.state.denormalize(&row[..layout.state_dim]));
+        let latent_dim = self.chain.dim;
         let chunk = Chunk {
-            actions: self.actions.iter().map(|action| normalizer.action.denormalize(action)).collect(),
+            actions: actions.iter().map(|action| normalizer.action.denormalize(action)).collect(),
             planned_states: planned_states.collect(),
-            latent_mean: latent.mean,
-            latent_log_var: latent.log_var,
+            latent_mean: self.chain.mean[..latent_dim].to_vec(),
+            latent_log_var: self.chain.log_var[..latent_dim].to_vec(),
             predicted_state: normalizer.state.denormalize(&self.predicted_state),
             evaluations: self.evaluations,
             start: self.start,
+            degraded: self.degraded,
         };
-        let streaming = self.episode.options.streaming;
-        let window = Window { x: self.x, predicted_state: self.predicted_state, anchor: self.anchor };
         let mut episode = self.episode;
-        episode.planned = Some(Planned { state: self.state, actions: self.actions });
-        episode.window = streaming.then_some(window);
-        episode.latent = self.first_latent;
+        let window = Window { x: self.x, row: self.row, predicted_state: self.predicted_state, anchor: self.anchor };
+        episode.window = episode.options.streaming.then_some(window);
+        episode.planned = Some(Planned { state: self.state, actions });
+        episode.latent = (latent_dim > 0).then(|| (chunk.latent_mean.clone(), chunk.latent_log_var.clone()));
         Ok((episode, chunk))
     }
 }

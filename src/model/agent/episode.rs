@@ -1,7 +1,7 @@
 //! What one episode remembers between acts.
 
 use super::{Agent, AgentError, Observation, SamplerOptions};
-use crate::model::{latent::PlainGaussian, trajectory::Token};
+use crate::model::trajectory::Token;
 use std::collections::VecDeque;
 
 /// One episode as a value: what it remembers of the past, and its partly denoised window. Cloned, never changed in place by an act that
@@ -18,8 +18,8 @@ pub struct Episode {
     pub(super) planned: Option<Planned>,
     /// The window on its way down, if the last act left one (streaming).
     pub(super) window: Option<Window>,
-    /// Latent of the last chunk's first step.
-    pub(super) latent: Option<PlainGaussian>,
+    /// Mean and log-variance of the latent of the last chunk's first step.
+    pub(super) latent: Option<(Vec<f32>, Vec<f32>)>,
 }
 
 /// What the last act saw and answered, normalized units.
@@ -29,11 +29,13 @@ pub(super) struct Planned {
     pub(super) actions: Vec<Vec<f32>>,
 }
 
-/// A window at READY: position i at rung i + 1.
+/// A window at READY, position i at rung i + 1; above it only after an act that a deadline cut short.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Window {
     /// `T * D` values, normalized units.
     pub(super) x: Vec<f32>,
+    /// Row of the ladder.
+    pub(super) row: usize,
     /// The state it was built for.
     pub(super) predicted_state: Vec<f32>,
     /// Mean of the prior latent of position 0 at the last cold start.
@@ -78,7 +80,7 @@ impl Episode {
 
     /// Latent mean and log-variance after the last act, if there was one and the model has latents.
     pub fn latent(&self) -> Option<(&[f32], &[f32])> {
-        self.latent.as_ref().map(|latent| (latent.mean.as_slice(), latent.log_var.as_slice()))
+        self.latent.as_ref().map(|(mean, log_var)| (mean.as_slice(), log_var.as_slice()))
     }
 
     /// Resident size in bytes, for the session cap.
@@ -89,7 +91,7 @@ impl Episode {
         let planned = self.planned.as_ref();
         let planned: usize = planned.map_or(0, |p| floats(Some(&p.state)) + p.actions.iter().map(|a| 24 + floats(Some(a))).sum::<usize>());
         let window = self.window.as_ref().map_or(0, |w| [&w.x, &w.predicted_state, &w.anchor].map(|v| floats(Some(v))).iter().sum());
-        let latent = self.latent.as_ref().map_or(0, |latent| floats(Some(&latent.mean)) + floats(Some(&latent.log_var)));
+        let latent = self.latent.as_ref().map_or(0, |(mean, log_var)| floats(Some(mean)) + floats(Some(log_var)));
         size_of::<Self>() + history + planned + window + latent
     }
 }

@@ -83,7 +83,15 @@ impl Agent {
         let executed = self.executed_tokens(&episode, observation)?;
         let aligned = executed.len() == episode.options.action_horizon;
         episode.commit(executed, self.config.block_len.max(self.config.obs_horizon));
-        Ok(Descent::new(episode, self.config.normalizer.state.normalize(&state), aligned))
+        let ladder = Ladder::new(self.config.plan_horizon, episode.options.sub_steps, self.config.level_max);
+        let ladder = ladder.map_err(|reason| AgentError::InvalidOptions { field: "sub_steps", reason })?;
+        Ok(Descent::new(episode, self.config.normalizer.state.normalize(&state), ladder, aligned, &self.config))
+    }
+
+    /// For an act that has no time for another evaluation: gives out what there is, if there is anything (the last estimate, or the
+    /// window that the act before left), and says whether there was; then the descent is done.
+    pub fn cut_short(&self, descent: &mut Descent) -> bool {
+        descent.cut_short(self.walk())
     }
 
     /// The new episode and the chunk of a descent that is done.

@@ -233,8 +233,7 @@ fn plain_sampler(agent: &Agent, state: &[f32], options: &SamplerOptions) -> Vec<
         let (from, to) = (4 * step, 4 * (step - 1));
         (0..3).for_each(|column| x[column] = f64::from(state[column]));
         let input = Tensor::from_vec(x.iter().map(|v| *v as f32).collect(), (1, 1, 5), &Device::Cpu).unwrap();
-        let levels = Tensor::from_vec(vec![from as f32], (1, 1), &Device::Cpu).unwrap();
-        let condition = Condition { levels: &levels, latents: None, observed: None };
+        let condition = Condition { levels: &[from as f32], latents: None, observed: None };
         let x0: Vec<f32> = agent.networks.denoiser.predict(&input, &condition).unwrap().flatten_all().unwrap().to_vec1().unwrap();
         let (a, b) = (agent.process.alpha_bar(from), agent.process.alpha_bar(to));
         let z = draw((step - 1) as u32, Slot::Jump);
@@ -263,16 +262,14 @@ fn rows_hold_the_real_state_and_refine_once_an_action() {
     let ladder = Ladder::new(HORIZON, 2, 40).unwrap();
     let (mut refined, mut emitted) = (0, 0);
     while !descents[0].is_done() {
-        if descents[0].has_started() && descents[0].wants_refinement(&ladder) {
-            let walk = super::descent::Walk { config: &agent.config, process: &agent.process, ladder };
-            let noise = [0, 1].map(|position| descents[0].noisy_token(position, &walk).noise);
+        if descents[0].has_started() && descents[0].wants_refinement() {
+            let noise = [0, 1].map(|position| descents[0].noisy_token(position, agent.walk()).noise);
             assert_eq!(noise, [ladder.level(2), ladder.level(4)].map(|level| agent.process.sigma(level)));
             refined += 1;
         }
         agent.advance(&mut descents).unwrap();
-        let imagined = descents[0].block.len() > descents[0].episode.history.len();
-        emitted = descents[0].block.len() - descents[0].episode.history.len();
-        if !imagined {
+        emitted = descents[0].emitted();
+        if emitted == 0 {
             assert_eq!(descents[0].x[..3], descents[0].state[..]);
         }
     }

@@ -104,6 +104,8 @@ pub struct Chunk {
     pub evaluations: u32,
     /// How the window started.
     pub start: Start,
+    /// Whether a deadline cut the descent short.
+    pub degraded: bool,
 }
 
 /// How the window of an act started.

@@ -2,12 +2,12 @@
 
 use super::Inputs;
 use crate::model::nn::{
-    LayerNorm, Linear, attention, gelu_tanh, mish,
+    Activation::{GeluTanh, Mish, Silu},
+    LayerNorm, Linear, Value,
     params::{Init, Params},
-    silu,
-    time_embedding::sinusoid,
+    time_embedding::Sinusoid,
 };
-use candle_core::{D, Device, Result, Tensor};
+use candle_core::Result;
 
 const EPS: f64 = 1e-6;
 
@@ -33,19 +33,20 @@ impl Block {
         })
     }
 
-    fn forward(&self, x: &Tensor, cond: &Tensor) -> Result<Tensor> {
-        let ada = self.ada.forward(cond)?.chunk(6, D::Minus1)?;
-        let h = modulate(&self.norm.forward(x)?, &ada[0], &ada[1])?;
-        let h = self.out.forward(&attention(&self.qkv.forward(&h)?, self.heads)?)?;
-        let x = (x + (&ada[2] * h)?)?;
-        let h = modulate(&self.norm.forward(&x)?, &ada[3], &ada[4])?;
-        let h = self.mlp[1].forward(&gelu_tanh(&self.mlp[0].forward(&h)?)?)?;
-        x + (&ada[5] * h)?
+    fn forward<V: Value>(&self, x: V, cond: &V) -> Result<V> {
+        let ada = self.ada.forward(cond)?;
+        let h = self.norm.forward(&x)?.modulated(&ada, 0)?;
+        let h = self.out.forward(&self.qkv.forward(&h)?.attention(self.heads)?)?;
+        let x = x.plus_gated(&h, &ada, 2)?;
+        let h = self.norm.forward(&x)?.modulated(&ada, 3)?;
+        let h = self.mlp[1].forward(&self.mlp[0].forward(&h)?.activated(GeluTanh)?)?;
+        x.plus_gated(&h, &ada, 5)
     }
 }
 
 /// `(B, T, d_in)` to `(B, T, d_out)`.
 pub(super) struct Dit {
+    sinusoid: Sinusoid,
     inp: Linear,
     time: [Linear; 2],
     /// Latents and noisy values reach the condition as well: the gates may depend on them.
@@ -54,16 +55,17 @@ pub(super) struct Dit {
     norm: LayerNorm,
     ada: Linear,
     out: Linear,
-    width: usize,
 }
 
 impl Dit {
-    pub(super) fn new([d_in, d_out]: [usize; 2], width: usize, [depth, heads]: [usize; 2], params: &Params) -> Result<Self> {
+    /// Ready for whole levels, and positions, up to `level_max`.
+    pub(super) fn new([d_in, d_out, width]: [usize; 3], [depth, heads]: [usize; 2], level_max: usize, params: &Params) -> Result<Self> {
         if heads == 0 || !width.is_multiple_of(heads) {
             candle_core::bail!("denoiser.width {width} must be a multiple of denoiser.heads {heads}");
         }
         let blocks = (0..depth).map(|i| Block::new(width, heads, &params.scope("blocks").scope(i)));
         Ok(Self {
+            sinusoid: Sinusoid::new(width, level_max)?,
             inp: Linear::new(d_in, width, &params.scope("inp"))?,
             time: [Linear::new(width, width, &params.scope("time.0"))?, Linear::new(width, width, &params.scope("time.2"))?],
             context: Linear::new(d_in, width, &params.scope("context"))?,
@@ -71,41 +73,44 @@ impl Dit {
             norm: LayerNorm::new(width, false, EPS, params)?,
             ada: zero_linear(width, 2 * width, &params.scope("ada"))?,
             out: zero_linear(width, d_out, &params.scope("out"))?,
-            width,
         })
     }
 
-    pub(super) fn forward(&self, inputs: &Inputs) -> Result<Tensor> {
-        let cond = silu(&self.embed(inputs)?)?;
-        let mut x = self.inp.forward(inputs.x)?.broadcast_add(&self.positions(inputs.x.dim(1)?)?)?;
+    pub(super) fn forward<V: Value>(&self, inputs: &Inputs<V>) -> Result<V> {
+        let cond = self.embed(inputs)?.activated(Silu)?;
+        let mut x = self.inp.forward(inputs.x)?.plus(&self.positions(inputs.x)?)?;
         for block in &self.blocks {
-            x = block.forward(&x, &cond)?;
+            x = block.forward(x, &cond)?;
         }
-        let ada = self.ada.forward(&cond)?.chunk(2, D::Minus1)?;
-        self.out.forward(&modulate(&self.norm.forward(&x)?, &ada[0], &ada[1])?)
+        let ada = self.ada.forward(&cond)?;
+        self.out.forward(&self.norm.forward(&x)?.modulated(&ada, 0)?)
     }
 
     /// `(B, T, width)`: level of each position, its inputs, and the real steps.
-    fn embed(&self, inputs: &Inputs) -> Result<Tensor> {
-        let level = sinusoid(inputs.levels, self.width)?;
-        let emb = self.time[1].forward(&mish(&self.time[0].forward(&level)?)?)?;
-        let emb = (emb + self.context.forward(inputs.x)?)?;
+    fn embed<V: Value>(&self, inputs: &Inputs<V>) -> Result<V> {
+        let level = self.sinusoids(inputs.x, |index| inputs.levels[index])?;
+        let emb = self.time[1].forward(&self.time[0].forward(&level)?.activated(Mish)?)?;
+        let emb = emb.plus(&self.context.forward(inputs.x)?)?;
         match &inputs.observed {
-            Some(observed) => emb.broadcast_add(&observed.unsqueeze(1)?),
+            Some(observed) => emb.plus_at_each_step(observed),
             None => Ok(emb),
         }
     }
 
-    fn positions(&self, len: usize) -> Result<Tensor> {
-        let index: Vec<f32> = (0..len).map(|i| i as f32).collect();
-        sinusoid(&Tensor::from_vec(index, (1, len), &Device::Cpu)?, self.width)
+    fn positions<V: Value>(&self, x: &V) -> Result<V> {
+        let [_, len, _] = x.shape()?;
+        self.sinusoids(x, |index| (index % len) as f32)
+    }
+
+    /// `(B, T, width)` for the batch and the positions of `x`: the sinusoid of `level(b T + t)`.
+    fn sinusoids<V: Value>(&self, x: &V, level: impl Fn(usize) -> f32) -> Result<V> {
+        let ([batch, len, _], width) = (x.shape()?, self.sinusoid.dim());
+        V::generate([batch, len, width], |out| {
+            out.chunks_exact_mut(width).enumerate().for_each(|(index, out)| self.sinusoid.write(level(index), out));
+        })
     }
 }
 
 fn zero_linear(d_in: usize, d_out: usize, params: &Params) -> Result<Linear> {
     Linear::with_init(d_in, d_out, Init::Const(0.0), Init::Const(0.0), params)
-}
-
-fn modulate(x: &Tensor, shift: &Tensor, scale: &Tensor) -> Result<Tensor> {
-    (x * (scale + 1.0)?)? + shift
 }

@@ -5,9 +5,9 @@ mod unet;
 
 use crate::model::{
     config::ModelConfig,
-    nn::{Linear, params::Params, silu, time_embedding::sinusoid},
+    nn::{Activation::Silu, Linear, Value, params::Params, time_embedding::Sinusoid},
 };
-use candle_core::{D, Result, Tensor};
+use candle_core::Result;
 use dit::Dit;
 use serde::{Deserialize, Serialize};
 use unet::Unet;
@@ -40,13 +40,13 @@ pub enum DenoiserConfig {
 }
 
 /// What the denoiser knows beside the noisy window.
-pub struct Condition<'a> {
-    /// `(B, T)` level of each position, 0 ..= level_max.
-    pub levels: &'a Tensor,
+pub struct Condition<'a, V> {
+    /// `B * T` levels, one a position, 0 ..= level_max.
+    pub levels: &'a [f32],
     /// `(B, T, latent_dim)`, for models with latents.
-    pub latents: Option<&'a Tensor>,
-    /// `(B, (T_o - 1) * (state_dim + action_dim))` real steps, for models with `obs_horizon > 1`.
-    pub observed: Option<&'a Tensor>,
+    pub latents: Option<&'a V>,
+    /// `(B, 1, (T_o - 1) * (state_dim + action_dim))` real steps, for models with `obs_horizon > 1`.
+    pub observed: Option<&'a V>,
 }
 
 enum Backbone {
@@ -55,17 +55,18 @@ enum Backbone {
 }
 
 /// What a backbone is given: the input channels of each position, their levels, and a vector for the whole window.
-struct Inputs<'a> {
+struct Inputs<'a, V> {
     /// `(B, T, d_in)`: window, latents, level embedding side by side.
-    x: &'a Tensor,
-    /// `(B, T)`.
-    levels: &'a Tensor,
-    /// `(B, emb)` embedding of the real steps.
-    observed: Option<Tensor>,
+    x: &'a V,
+    /// `B * T`.
+    levels: &'a [f32],
+    /// `(B, 1, emb)` embedding of the real steps.
+    observed: Option<V>,
 }
 
 /// The denoiser of a model.
 pub struct Denoiser {
+    sinusoid: Sinusoid,
     backbone: Backbone,
     input_skip: Linear,
     observed: Option<[Linear; 2]>,
@@ -82,7 +83,8 @@ impl Denoiser {
         let (backbone, emb) = match &config.denoiser {
             DenoiserConfig::Unet { widths } => (Backbone::Unet(Box::new(Unet::new(d_in, d_out, widths, params)?)), unet::EMB),
             DenoiserConfig::Dit { width, depth, heads } => {
-                (Backbone::Dit(Box::new(Dit::new([d_in, d_out], *width, [*depth, *heads], params)?)), *width)
+                let sizes = [d_in, d_out, *width];
+                (Backbone::Dit(Box::new(Dit::new(sizes, [*depth, *heads], config.level_max, params)?)), *width)
             }
         };
         let observed = match config.obs_horizon {
@@ -92,32 +94,43 @@ impl Denoiser {
                 Linear::new(OBSERVED_HIDDEN, emb, &params.scope("observed.2"))?,
             ]),
         };
-        Ok(Self { backbone, input_skip: Linear::new(d_in, d_out, &params.scope("input_skip"))?, observed })
+        let sinusoid = Sinusoid::new(LEVEL_CHANNELS, config.level_max)?;
+        Ok(Self { sinusoid, backbone, input_skip: Linear::new(d_in, d_out, &params.scope("input_skip"))?, observed })
     }
 
     /// Estimate of the clean window, `(B, T, D)` to `(B, T, D)`. Row b depends on row b of the inputs alone.
     ///
     /// # Errors
     /// If a shape differs from the configuration, or a condition the network was built with is missing.
-    pub fn predict(&self, x: &Tensor, condition: &Condition) -> Result<Tensor> {
-        let embedded = sinusoid(condition.levels, LEVEL_CHANNELS)?;
+    pub fn predict<V: Value>(&self, x: &V, condition: &Condition<V>) -> Result<V> {
+        let [batch, len, _] = x.shape()?;
+        if condition.levels.len() != batch * len {
+            candle_core::bail!("{} levels for {batch} windows of {len}", condition.levels.len());
+        }
+        let embedded = V::generate([batch, len, LEVEL_CHANNELS], |out| {
+            let rows = condition.levels.iter().zip(out.chunks_exact_mut(LEVEL_CHANNELS));
+            rows.for_each(|(level, out)| self.sinusoid.write(*level, out));
+        })?;
         let x = match condition.latents {
-            Some(latents) => Tensor::cat(&[x, latents, &embedded], D::Minus1)?,
-            None => Tensor::cat(&[x, &embedded], D::Minus1)?,
+            Some(latents) => V::beside(&[x, latents, &embedded])?,
+            None => V::beside(&[x, &embedded])?,
         };
         let inputs = Inputs { x: &x, levels: condition.levels, observed: self.embed_observed(condition.observed)? };
         let out = match &self.backbone {
             Backbone::Unet(net) => net.forward(&inputs)?,
             Backbone::Dit(net) => net.forward(&inputs)?,
         };
-        out + self.input_skip.forward(&x)?
+        out.plus(&self.input_skip.forward(&x)?)
     }
 
-    fn embed_observed(&self, observed: Option<&Tensor>) -> Result<Option<Tensor>> {
+    fn embed_observed<V: Value>(&self, observed: Option<&V>) -> Result<Option<V>> {
         match (&self.observed, observed) {
-            (Some([first, second]), Some(steps)) => Ok(Some(second.forward(&silu(&first.forward(steps)?)?)?)),
+            (Some([first, second]), Some(steps)) => second.forward(&first.forward(steps)?.activated(Silu)?).map(Some),
             (Some(_), None) => candle_core::bail!("this denoiser needs the real steps before the window (obs_horizon > 1)"),
             (None, _) => Ok(None),
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -2,9 +2,9 @@
 
 use super::Inputs;
 use crate::model::nn::{
-    Conv1d, ConvShape, ConvTranspose1d, GroupNormMish, Linear, add_channel_bias, mish, params::Params, time_embedding::sinusoid,
+    Activation::Mish, Conv1d, ConvShape, ConvTranspose1d, GroupNormMish, Linear, Value, params::Params, time_embedding::Sinusoid,
 };
-use candle_core::{D, Result, Tensor};
+use candle_core::Result;
 
 /// Width of the embedding of the mean level and of the real steps.
 pub(super) const EMB: usize = 32;
@@ -25,8 +25,8 @@ impl ConvBlock {
         })
     }
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        self.norm.forward(&self.conv.forward(x)?)
+    fn forward<V: Value>(&self, x: &V) -> Result<V> {
+        self.norm.forward(self.conv.forward(x)?)
     }
 }
 
@@ -49,13 +49,13 @@ impl ResBlock {
         })
     }
 
-    /// `x` (B, T, c_in), `emb` (B, EMB) already through Mish.
-    fn forward(&self, x: &Tensor, emb: &Tensor) -> Result<Tensor> {
-        let h = add_channel_bias(&self.first.forward(x)?, &self.embed.forward(emb)?)?;
+    /// `x` (B, T, c_in), `emb` (B, 1, EMB) already through Mish.
+    fn forward<V: Value>(&self, x: &V, emb: &V) -> Result<V> {
+        let h = self.first.forward(x)?.plus_at_each_step(&self.embed.forward(emb)?)?;
         let h = self.second.forward(&h)?;
         match &self.skip {
-            Some(skip) => h + skip.forward(x)?,
-            None => h + x,
+            Some(skip) => h.plus(&skip.forward(x)?),
+            None => h.plus(x),
         }
     }
 }
@@ -72,6 +72,7 @@ struct Up {
 
 /// `(B, T, d_in)` to `(B, T, d_out)`.
 pub(super) struct Unet {
+    sinusoid: Sinusoid,
     time: [Linear; 2],
     down: Vec<Down>,
     mid: [ResBlock; 2],
@@ -89,6 +90,7 @@ impl Unet {
             pairs.iter().enumerate().map(|(j, (a, b))| Self::new_down([*a, *b], j + 1 == pairs.len(), &params.scope("down").scope(j)));
         let up = pairs.iter().skip(1).rev().enumerate().map(|(j, (a, b))| Self::new_up([*a, *b], &params.scope("up").scope(j)));
         Ok(Self {
+            sinusoid: Sinusoid::new(EMB, 0)?,
             time: [Linear::new(EMB, 4 * EMB, &params.scope("time.0"))?, Linear::new(4 * EMB, EMB, &params.scope("time.2"))?],
             down: down.collect::<Result<_>>()?,
             mid: [ResBlock::new(bottom, bottom, &params.scope("mid1"))?, ResBlock::new(bottom, bottom, &params.scope("mid2"))?],
@@ -114,37 +116,44 @@ impl Unet {
         })
     }
 
-    pub(super) fn forward(&self, inputs: &Inputs) -> Result<Tensor> {
-        let emb = mish(&self.embed(inputs)?)?;
-        let mut x = inputs.x.clone();
-        let mut skips = Vec::with_capacity(self.down.len());
-        for level in &self.down {
-            x = through(&level.blocks, &x, &emb)?;
-            skips.push(x.clone());
-            if let Some(halve) = &level.halve {
-                x = halve.forward(&x)?;
-            }
-        }
-        x = through(&self.mid, &x, &emb)?;
-        // The full-resolution skip is kept last and never used: all up levels double the length (Janner's network does the same).
-        for (level, skip) in self.up.iter().zip(skips.iter().rev()) {
-            x = through(&level.blocks, &Tensor::cat(&[&x, skip], D::Minus1)?, &emb)?;
-            x = level.double.forward(&x)?;
-        }
-        self.out.forward(&self.last.forward(&x)?)
+    pub(super) fn forward<V: Value>(&self, inputs: &Inputs<V>) -> Result<V> {
+        let emb = self.embed(inputs)?.activated(Mish)?;
+        let h = self.through_depth(0, inputs.x, &emb)?;
+        self.out.forward(&self.last.forward(&h)?)
     }
 
-    /// Embedding of the window's mean level, plus that of the real steps.
-    fn embed(&self, inputs: &Inputs) -> Result<Tensor> {
-        let level = sinusoid(&inputs.levels.mean(1)?, EMB)?;
-        let emb = self.time[1].forward(&mish(&self.time[0].forward(&level)?)?)?;
+    /// Down at this depth, through all below it, and up again; what comes out of depth `j > 0` is at the resolution of depth `j - 1`.
+    /// The skip of depth 0 is never used: all up levels double the length (Janner's network does the same).
+    fn through_depth<V: Value>(&self, depth: usize, x: &V, emb: &V) -> Result<V> {
+        let level = &self.down[depth];
+        let skip = through(&level.blocks, x, emb)?;
+        let h = match &level.halve {
+            Some(halve) => self.through_depth(depth + 1, &halve.forward(&skip)?, emb)?,
+            None => through(&self.mid, &skip, emb)?,
+        };
+        if depth == 0 {
+            return Ok(h);
+        }
+        let level = &self.up[self.up.len() - depth];
+        level.double.forward(&through(&level.blocks, &V::beside(&[&h, &skip])?, emb)?)
+    }
+
+    /// `(B, 1, EMB)`: embedding of each window's mean level, plus that of the real steps.
+    fn embed<V: Value>(&self, inputs: &Inputs<V>) -> Result<V> {
+        let [batch, len, _] = inputs.x.shape()?;
+        let level = V::generate([batch, 1, EMB], |out| {
+            for (levels, out) in inputs.levels.chunks_exact(len).zip(out.chunks_exact_mut(EMB)) {
+                self.sinusoid.write(levels.iter().sum::<f32>() / len as f32, out);
+            }
+        })?;
+        let emb = self.time[1].forward(&self.time[0].forward(&level)?.activated(Mish)?)?;
         match &inputs.observed {
-            Some(observed) => emb + observed,
+            Some(observed) => emb.plus(observed),
             None => Ok(emb),
         }
     }
 }
 
-fn through(blocks: &[ResBlock; 2], x: &Tensor, emb: &Tensor) -> Result<Tensor> {
+fn through<V: Value>(blocks: &[ResBlock; 2], x: &V, emb: &V) -> Result<V> {
     blocks[1].forward(&blocks[0].forward(x, emb)?, emb)
 }

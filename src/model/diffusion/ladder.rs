@@ -29,6 +29,11 @@ impl Ladder {
         self.horizon * self.sub_steps
     }
 
+    /// Rows of a rung (n).
+    pub fn rung(&self) -> usize {
+        self.sub_steps
+    }
+
     /// Row at which the window is (k_1, ..., k_T): position 0 is refined here.
     pub fn ready(&self) -> usize {
         self.sub_steps * (self.horizon - 1)

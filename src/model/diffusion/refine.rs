@@ -11,8 +11,8 @@ use crate::model::{
     Networks,
     config::ModelConfig,
     denoiser::Condition,
-    latent::{Gaussian, LatentModel, stack_steps},
-    trajectory::{Layout, Tokens},
+    latent::{Gaussian, LatentModel, Tokens},
+    trajectory::Layout,
 };
 use candle_core::{Device, Result, Tensor};
 use serde::{Deserialize, Serialize};
@@ -46,7 +46,7 @@ pub struct WindowBatch {
     pub history: Tokens,
     /// `(B, T, state_dim + action_dim)` clean windows; position 0 is the current time.
     pub window: Tensor,
-    /// `(B, (T_o - 1) * (state_dim + action_dim))` real steps before the window for the denoiser, zeros before the start; `None` if T_o = 1.
+    /// `(B, 1, (T_o - 1) * (state_dim + action_dim))` real steps before the window for the denoiser, zeros before the start; `None` if T_o = 1.
     pub observed: Option<Tensor>,
     /// Ladder row of each window, `0 .. sub_steps * T`.
     pub rows: Vec<usize>,
@@ -72,7 +72,8 @@ const LITERAL_PRIOR_WEIGHT: f64 = 0.1;
 /// Levels of a batch of windows, and the windows noised to them.
 struct Noised {
     x: Tensor,
-    levels: Tensor,
+    /// `B * T`.
+    levels: Vec<f32>,
     /// `(B, T, 1)` standard deviation of the noise.
     sigma: Tensor,
     /// Whether a window is at or below rung 1, where its latents are refined.
@@ -135,10 +136,9 @@ impl Networks {
 
 /// Prior roll-out from real history and the current state: what a sampler above READY has.
 fn prior_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<Tensor> {
-    let len = batch.window.dim(1)?;
     let current = window_tokens(batch, &batch.window, 0..1, [1.0, 0.0], None)?;
     let filter = latent.infer(&batch.history.concat(&current)?)?;
-    means(&latent.roll_out(&filter, len)?)
+    chain_means(latent, filter, Vec::new(), batch.window.dim(1)?)
 }
 
 /// Posterior of position 0 from history and the noised tokens 0 and 1, and the prior chain from it: what a sampler at READY has.
@@ -146,9 +146,18 @@ fn refined_latents(latent: &LatentModel, batch: &WindowBatch, noised: &Noised) -
     let len = batch.window.dim(1)?;
     let tokens = window_tokens(batch, &noised.x, 0..len.min(2), [1.0, 1.0], Some(&noised.sigma))?;
     let posterior = latent.infer(&batch.history.concat(&tokens)?)?;
-    let mut chain = vec![posterior];
-    chain.extend(latent.roll_out(&chain[0], len - 1)?);
-    means(&chain)
+    let head = posterior.mean.clone();
+    chain_means(latent, posterior, vec![head], len - 1)
+}
+
+/// `head` and the means of the `len` latents that the prior tells after `start`, step after step.
+fn chain_means(latent: &LatentModel, start: Gaussian, head: Vec<Tensor>, len: usize) -> Result<Tensor> {
+    let mut means = head;
+    latent.roll_out(start, len, |next| {
+        means.push(next.mean.clone());
+        Ok(())
+    })?;
+    Tensor::cat(&means, 1)
 }
 
 /// Posteriors of every position from the clean window itself; the last position, which has no successor, keeps the prior.
@@ -159,10 +168,6 @@ fn teacher_forced_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<T
     let posteriors = latent.posteriors(&tokens, &seen)?.narrow(before, len - 1)?;
     let last = latent.prior.predict(&posteriors.narrow(len - 2, 1)?)?;
     Tensor::cat(&[posteriors.mean, last.mean], 1)
-}
-
-fn means(chain: &[Gaussian]) -> Result<Tensor> {
-    stack_steps(&chain.iter().map(|step| step.mean.clone()).collect::<Vec<_>>())
 }
 
 /// Positions `range` of the windows `x` as tokens: state and action as `present` says, no reward (it is not generated).
@@ -207,7 +212,7 @@ fn noise_windows(config: &ModelConfig, batch: &WindowBatch, options: &RefineOpti
     let tensor = |values| Tensor::from_vec(values, (count, len, dim), &Device::Cpu);
     Ok(Noised {
         x: ((tensor(signal)? * &batch.window)? + (tensor(noise)? * &batch.noise)?)?,
-        levels: Tensor::from_vec(levels.iter().map(|level| *level as f32).collect::<Vec<_>>(), (count, len), &Device::Cpu)?,
+        levels: levels.iter().map(|level| *level as f32).collect(),
         sigma: Tensor::from_vec(levels.iter().map(|level| process.sigma(*level)).collect::<Vec<_>>(), (count, len, 1), &Device::Cpu)?,
         ready: batch.rows.iter().map(|row| *row >= ladder.ready()).collect(),
     })

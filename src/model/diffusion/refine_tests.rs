@@ -34,7 +34,7 @@ fn batch(window: Vec<f32>, noise: Vec<f32>, row: usize) -> WindowBatch {
     let history: Vec<Vec<Token>> = (0..BATCH).map(|b| (0..3).map(|i| token(b + i)).collect()).collect();
     let tensor = |values| Tensor::from_vec(values, (BATCH, LEN, DIM), &Device::Cpu).unwrap();
     WindowBatch {
-        history: Tokens::pack(config().layout, &history).unwrap(),
+        history: Tokens::pack(config().layout, history.iter(), 3, |row, position| row[position].view()).unwrap(),
         window: tensor(window),
         observed: None,
         rows: vec![row; BATCH],

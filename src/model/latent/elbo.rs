@@ -1,7 +1,6 @@
 //! The loss of stage 1: evidence lower bound over a block (equation of section 4.2; appendix A.4).
 
-use super::{Gaussian, LatentModel};
-use crate::model::trajectory::Tokens;
+use super::{Gaussian, LatentModel, Tokens};
 use candle_core::{Result, Tensor};
 
 /// One batch of blocks.
@@ -60,7 +59,7 @@ impl LatentModel {
             present: flat(&successors.present)?,
             noise: flat(&successors.noise)?,
         };
-        let after = self.encoder.states(&successors, Some(&states.reshape((rows, ()))?))?;
+        let after = self.encoder.states(&successors, Some(&states.reshape((rows, 1, ()))?))?;
         self.encoder.posterior(&after.reshape((batch, len - 1, ()))?)
     }
 

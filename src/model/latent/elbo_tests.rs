@@ -39,7 +39,7 @@ fn batch() -> ElboBatch {
     let present = (0..BATCH * (LEN - 1)).flat_map(|i| [1.0, f32::from(i % 2 == 0), f32::from(i % 4 == 0)]).collect::<Vec<_>>();
     let tensor = |values: Vec<f32>, width| Tensor::from_vec(values, (BATCH, LEN - 1, width), &Device::Cpu).unwrap();
     ElboBatch {
-        tokens: Tokens::pack(layout(), &rows).unwrap(),
+        tokens: Tokens::pack(layout(), rows.iter(), LEN, |row, position| row[position].view()).unwrap(),
         valid: tensor(valid, 1).squeeze(2).unwrap(),
         successor_present: tensor(present, 3),
         eps: tensor(draw(BATCH * (LEN - 1) * DIM), DIM),

@@ -1,22 +1,22 @@
 //! Tokens to posterior: embeddings, GRU and Gaussian head (appendix A.4 of the paper: Stage 1 networks).
 
-use super::{Gaussian, LatentConfig};
+use super::{Gaussian, LatentConfig, Tokens};
 use crate::model::{
     nn::{
-        Gru, Linear,
+        Activation::Relu,
+        Gru, Linear, Value,
         params::{Init, Params},
-        relu,
     },
-    trajectory::{Layout, Tokens},
+    trajectory::Layout,
 };
-use candle_core::{D, DType, Device, Result, Tensor};
+use candle_core::{Result, Tensor};
 
 const STATE_WIDTH: usize = 32;
 const ACTION_WIDTH: usize = 16;
 const REWARD_WIDTH: usize = 16;
 const TOKEN_WIDTH: usize = 64;
 /// Bounds of a latent's log-variance.
-pub(super) const LOG_VAR: (f64, f64) = (-8.0, 2.0);
+pub(super) const LOG_VAR: (f32, f32) = (-8.0, 2.0);
 
 /// One part of a token: a ReLU layer where present, a learned vector where absent.
 struct Part {
@@ -30,11 +30,8 @@ impl Part {
     }
 
     /// `value` (B, L, d_in), `present` (B, L, 1) of 0 or 1.
-    fn forward(&self, value: &Tensor, present: &Tensor) -> Result<Tensor> {
-        let seen = relu(&self.embed.forward(value)?)?.broadcast_mul(present)?;
-        let (b, l, _) = present.dims3()?;
-        let absent = present.affine(-1.0, 1.0)?.reshape((b * l, 1))?.matmul(&self.absent.unsqueeze(0)?)?;
-        seen + absent.reshape((b, l, ()))?
+    fn forward<V: Value>(&self, value: &V, present: &V) -> Result<V> {
+        self.embed.forward(value)?.activated(Relu)?.or_absent(present, &self.absent)
     }
 }
 
@@ -47,7 +44,6 @@ pub struct Encoder {
     gru: Gru,
     mean: Linear,
     log_var: Linear,
-    hidden: usize,
 }
 
 impl Encoder {
@@ -61,7 +57,6 @@ impl Encoder {
             gru: Gru::new(TOKEN_WIDTH, config.hidden, &params.scope("gru"))?,
             mean: Linear::new(config.hidden, config.dim, &params.scope("mean"))?,
             log_var: Linear::new(config.hidden, config.dim, &params.scope("log_var"))?,
-            hidden: config.hidden,
         })
     }
 
@@ -69,33 +64,25 @@ impl Encoder {
     ///
     /// # Errors
     /// If widths differ from the layout.
-    pub fn states(&self, tokens: &Tokens, before: Option<&Tensor>) -> Result<Tensor> {
-        let (batch, _) = tokens.batch_len()?;
-        let x = self.embed(tokens)?;
-        match before {
-            Some(before) => self.gru.forward(&x, before),
-            None => self.gru.forward(&x, &Tensor::zeros((batch, self.hidden), DType::F32, &Device::Cpu)?),
-        }
+    pub fn states<V: Value>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
+        self.gru.forward(&self.embed(tokens)?, before)
     }
 
     /// Posterior from GRU states `(.., hidden)`.
     ///
     /// # Errors
     /// If the width differs.
-    pub fn posterior(&self, states: &Tensor) -> Result<Gaussian> {
-        let states = states.contiguous()?;
-        Ok(Gaussian { mean: self.mean.forward(&states)?, log_var: self.log_var.forward(&states)?.clamp(LOG_VAR.0, LOG_VAR.1)? })
+    pub fn posterior<V: Value>(&self, states: &V) -> Result<Gaussian<V>> {
+        let log_var = self.log_var.forward(states)?.clamped(LOG_VAR.0, LOG_VAR.1)?;
+        Ok(Gaussian { mean: self.mean.forward(states)?, log_var })
     }
 
-    fn embed(&self, tokens: &Tokens) -> Result<Tensor> {
-        let present = |part: usize| tokens.present.narrow(2, part, 1)?.contiguous();
-        let parts = [
-            self.state.forward(&tokens.state, &present(0)?)?,
-            self.action.forward(&tokens.action, &present(1)?)?,
-            self.reward.forward(&tokens.reward, &present(2)?)?,
-            tokens.noise.clone(),
-        ];
-        let x = Tensor::cat(&parts, D::Minus1)?;
-        relu(&self.mlp[1].forward(&relu(&self.mlp[0].forward(&x)?)?)?)
+    fn embed<V: Value>(&self, tokens: &Tokens<V>) -> Result<V> {
+        let part = |part: &Part, value, index| part.forward(value, &tokens.present.channels(index, 1)?);
+        let [state, action, reward] =
+            [part(&self.state, &tokens.state, 0)?, part(&self.action, &tokens.action, 1)?, part(&self.reward, &tokens.reward, 2)?];
+        let x = V::beside(&[&state, &action, &reward, &tokens.noise])?;
+        let x = self.mlp[0].forward(&x)?.activated(Relu)?;
+        self.mlp[1].forward(&x)?.activated(Relu)
     }
 }

@@ -1,14 +1,14 @@
-//! Diagonal Gaussians as pairs of tensors.
+//! Diagonal Gaussians as pairs of values, and the trust region.
 
 use candle_core::{Result, Tensor};
 
-/// A diagonal Gaussian; both tensors have the same shape, the last dimension being the latent's.
+/// A diagonal Gaussian; both values have the same shape, the last dimension being the latent's.
 #[derive(Clone, Debug)]
-pub struct Gaussian {
+pub struct Gaussian<V = Tensor> {
     /// Mean.
-    pub mean: Tensor,
+    pub mean: V,
     /// Logarithm of the variance.
-    pub log_var: Tensor,
+    pub log_var: V,
 }
 
 impl Gaussian {
@@ -44,70 +44,87 @@ impl Gaussian {
     }
 }
 
-/// A diagonal Gaussian of one row as plain numbers: what an episode remembers and the trust region works on.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct PlainGaussian {
+/// A diagonal Gaussian of one row, held elsewhere.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GaussianRef<'a> {
     /// Mean.
-    pub mean: Vec<f32>,
+    pub mean: &'a [f32],
     /// Logarithm of the variance.
-    pub log_var: Vec<f32>,
+    pub log_var: &'a [f32],
 }
 
 /// Halvings of the search for the trust region's border: 2^-20 of the way.
 const SHRINK_STEPS: u32 = 20;
 
-impl PlainGaussian {
+impl GaussianRef<'_> {
     /// KL(self || other) in nats.
-    pub fn kl(&self, other: &Self) -> f32 {
-        let terms = self.mean.iter().zip(&self.log_var).zip(other.mean.iter().zip(&other.log_var));
-        terms.map(|((mq, vq), (mp, vp))| 0.5 * (vp - vq - 1.0 + (vq.exp() + (mq - mp).powi(2)) / vp.exp())).sum()
+    pub fn kl(self, other: GaussianRef) -> f32 {
+        kl_on_the_way(other, self, 1.0)
     }
+}
 
-    /// The farthest Gaussian on the way from `center` to self with KL(it || center) <= kappa: mean and log-variance move in proportion.
-    /// 0 gives the center, infinity self.
-    pub fn within(&self, center: &Self, kappa: f32) -> Self {
-        if self.kl(center) <= kappa {
-            return self.clone();
-        }
-        let (mut inside, mut outside) = (0.0_f32, 1.0_f32);
-        for _ in 0..SHRINK_STEPS {
-            let middle = 0.5 * (inside + outside);
-            if center.toward(self, middle).kl(center) <= kappa { inside = middle } else { outside = middle }
-        }
-        center.toward(self, inside)
-    }
+/// KL(it || center) of the Gaussian that lies this share of the way from `center` to `goal`.
+fn kl_on_the_way(center: GaussianRef, goal: GaussianRef, share: f32) -> f32 {
+    let columns = goal.mean.iter().zip(goal.log_var).zip(center.mean.iter().zip(center.log_var));
+    let terms = columns.map(|((goal_mean, goal_var), (mp, vp))| {
+        let (mq, vq) = (between(*mp, *goal_mean, share), between(*vp, *goal_var, share));
+        0.5 * (vp - vq - 1.0 + (vq.exp() + (mq - mp).powi(2)) / vp.exp())
+    });
+    terms.sum()
+}
 
-    fn toward(&self, other: &Self, share: f32) -> Self {
-        let mix = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a + share * (b - a)).collect();
-        Self { mean: mix(&self.mean, &other.mean), log_var: mix(&self.log_var, &other.log_var) }
+fn between(from: f32, to: f32, share: f32) -> f32 {
+    if share == 1.0 { to } else { from + share * (to - from) }
+}
+
+/// Moves the Gaussian `(mean, log_var)` toward `center` as far as KL(it || center) <= kappa demands: mean and log-variance move in
+/// proportion. With kappa 0 it becomes the center, with infinity it stays.
+pub fn hold_within(mean: &mut [f32], log_var: &mut [f32], center: GaussianRef, kappa: f32) {
+    let goal = GaussianRef { mean, log_var };
+    if goal.kl(center) <= kappa {
+        return;
     }
+    let (mut inside, mut outside) = (0.0_f32, 1.0_f32);
+    for _ in 0..SHRINK_STEPS {
+        let middle = 0.5 * (inside + outside);
+        if kl_on_the_way(center, goal, middle) <= kappa { inside = middle } else { outside = middle }
+    }
+    mean.iter_mut().zip(center.mean).for_each(|(mean, from)| *mean = between(*from, *mean, inside));
+    log_var.iter_mut().zip(center.log_var).for_each(|(log_var, from)| *log_var = between(*from, *log_var, inside));
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn plain(mean: &[f32], log_var: &[f32]) -> PlainGaussian {
-        PlainGaussian { mean: mean.to_vec(), log_var: log_var.to_vec() }
+    fn plain<'a>(mean: &'a [f32], log_var: &'a [f32]) -> GaussianRef<'a> {
+        GaussianRef { mean, log_var }
     }
 
     /// Closed form for equal variances: half the squared distance of the means in units of the standard deviation.
     #[test]
     fn kl_of_shifted_means() {
         let (q, p) = (plain(&[1.0, 2.0], &[0.5, 0.5]), plain(&[0.0, 0.0], &[0.5, 0.5]));
-        assert!((q.kl(&p) - 2.5 / 0.5_f32.exp()).abs() < 1e-5);
-        assert_eq!(p.kl(&p), 0.0);
+        assert!((q.kl(p) - 2.5 / 0.5_f32.exp()).abs() < 1e-5);
+        assert_eq!(p.kl(p), 0.0);
     }
 
     #[test]
     fn trust_region_holds_and_is_used_up() {
-        let (q, p) = (plain(&[3.0, -1.0], &[-2.0, 1.0]), plain(&[0.0, 0.5], &[0.0, 0.2]));
+        let (mean, log_var, center) = ([3.0, -1.0], [-2.0, 1.0], plain(&[0.0, 0.5], &[0.0, 0.2]));
+        let held = |kappa| {
+            let (mut mean, mut log_var) = (mean, log_var);
+            hold_within(&mut mean, &mut log_var, center, kappa);
+            (mean, log_var)
+        };
         for kappa in [0.01, 0.1, 1.0] {
-            let kl = q.within(&p, kappa).kl(&p);
+            let (mean, log_var) = held(kappa);
+            let kl = plain(&mean, &log_var).kl(center);
             assert!(kl <= kappa && kl > 0.99 * kappa, "kappa {kappa}: {kl}");
         }
-        assert_eq!(q.within(&p, f32::INFINITY), q);
-        assert!(q.within(&p, 0.0).kl(&p) < 1e-9);
+        assert_eq!(held(f32::INFINITY), (mean, log_var));
+        let (mean, log_var) = held(0.0);
+        assert!(plain(&mean, &log_var).kl(center) < 1e-9);
     }
 
     /// The batched closed form is the plain one, row by row.
@@ -117,8 +134,8 @@ mod tests {
         let tensor = |values: &[f32]| Tensor::from_slice(values, (2, 2), device);
         let q = Gaussian { mean: tensor(&[1.0, 2.0, -0.5, 0.0])?, log_var: tensor(&[0.1, -1.0, 0.4, 0.3])? };
         let p = Gaussian { mean: tensor(&[0.0, 1.5, 0.5, 0.2])?, log_var: tensor(&[0.0, 0.5, -0.4, 0.3])? };
-        let first = plain(&[1.0, 2.0], &[0.1, -1.0]).kl(&plain(&[0.0, 1.5], &[0.0, 0.5]));
-        let second = plain(&[-0.5, 0.0], &[0.4, 0.3]).kl(&plain(&[0.5, 0.2], &[-0.4, 0.3]));
+        let first = plain(&[1.0, 2.0], &[0.1, -1.0]).kl(plain(&[0.0, 1.5], &[0.0, 0.5]));
+        let second = plain(&[-0.5, 0.0], &[0.4, 0.3]).kl(plain(&[0.5, 0.2], &[-0.4, 0.3]));
         let batched = q.kl(&p)?.to_vec1::<f32>()?;
         assert!((batched[0] - first).abs() < 1e-5 && (batched[1] - second).abs() < 1e-5);
         Ok(())

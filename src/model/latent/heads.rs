@@ -2,10 +2,10 @@
 
 use super::{Gaussian, encoder::LOG_VAR};
 use crate::model::{
-    nn::{Linear, params::Params, relu},
+    nn::{Activation::Relu, Linear, Value, params::Params},
     trajectory::Layout,
 };
-use candle_core::{D, Result, Tensor};
+use candle_core::Result;
 
 const PRIOR_WIDTH: usize = 32;
 const DECODER_WIDTH: usize = 64;
@@ -19,9 +19,9 @@ impl Mlp {
         Ok(Self([layer(0, d_in, hidden)?, layer(1, hidden, hidden)?, layer(2, hidden, d_out)?]))
     }
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let x = relu(&self.0[1].forward(&relu(&self.0[0].forward(x)?)?)?)?;
-        self.0[2].forward(&x)
+    fn forward<V: Value>(&self, x: &V) -> Result<V> {
+        let x = self.0[0].forward(x)?.activated(Relu)?;
+        self.0[2].forward(&self.0[1].forward(&x)?.activated(Relu)?)
     }
 }
 
@@ -41,10 +41,10 @@ impl Prior {
     ///
     /// # Errors
     /// If the width differs.
-    pub fn predict(&self, before: &Gaussian) -> Result<Gaussian> {
-        let out = self.mlp.forward(&Tensor::cat(&[&before.mean, &before.log_var], D::Minus1)?)?;
-        let part = |start| out.narrow(D::Minus1, start, self.dim)?.contiguous();
-        Ok(Gaussian { mean: (&before.mean + part(0)?)?, log_var: part(self.dim)?.clamp(LOG_VAR.0, LOG_VAR.1)? })
+    pub fn predict<V: Value>(&self, before: &Gaussian<V>) -> Result<Gaussian<V>> {
+        let out = self.mlp.forward(&V::beside(&[&before.mean, &before.log_var])?)?;
+        let mean = out.channels(0, self.dim)?.plus(&before.mean)?;
+        Ok(Gaussian { mean, log_var: out.channels(self.dim, self.dim)?.clamped(LOG_VAR.0, LOG_VAR.1)? })
     }
 }
 
@@ -67,8 +67,8 @@ impl Decoder {
     ///
     /// # Errors
     /// If widths differ.
-    pub fn predict(&self, state: &Tensor, action: &Tensor, latent: &Tensor) -> Result<(Tensor, Tensor)> {
-        let x = Tensor::cat(&[state, action, latent], D::Minus1)?;
+    pub fn predict<V: Value>(&self, state: &V, action: &V, latent: &V) -> Result<(V, V)> {
+        let x = V::beside(&[state, action, latent])?;
         Ok((self.state.forward(&x)?, self.reward.forward(&x)?))
     }
 }

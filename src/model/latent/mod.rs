@@ -3,16 +3,18 @@ pub mod elbo;
 mod encoder;
 mod gaussian;
 mod heads;
+mod tokens;
 
 pub use encoder::Encoder;
-pub use gaussian::{Gaussian, PlainGaussian};
+pub use gaussian::{Gaussian, GaussianRef, hold_within};
 pub use heads::{Decoder, Prior};
+pub use tokens::Tokens;
 
 use crate::model::{
-    nn::params::Params,
-    trajectory::{Layout, Tokens},
+    nn::{Value, params::Params},
+    trajectory::Layout,
 };
-use candle_core::{Result, Tensor};
+use candle_core::Result;
 use serde::{Deserialize, Serialize};
 
 /// Sizes of the latent model.
@@ -51,35 +53,26 @@ impl LatentModel {
         })
     }
 
-    /// Posterior after the last token of each block: `(B, L)` tokens to a Gaussian of `(B, dim)`.
+    /// Posterior after the last token of each block: `(B, L)` tokens to a Gaussian of `(B, 1, dim)`.
     ///
     /// # Errors
     /// If widths differ from the layout.
-    pub fn infer(&self, block: &Tokens) -> Result<Gaussian> {
+    pub fn infer<V: Value>(&self, block: &Tokens<V>) -> Result<Gaussian<V>> {
         let (_, len) = block.batch_len()?;
-        let states = self.encoder.states(block, None)?;
-        self.encoder.posterior(&states.narrow(1, len - 1, 1)?.squeeze(1)?)
+        self.encoder.posterior(&self.encoder.states(block, None)?.step(len - 1)?)
     }
 
-    /// The prior chain: the means of c_tau, c_{tau+1}, ... and their Gaussians, each fed the one before (section 4.2; the prior's input is
-    /// the pair mean, log-variance). `start` is the distribution of c_{tau-1}; returns `len` Gaussians of `(B, dim)`.
+    /// The prior chain: the Gaussians of c_tau, c_{tau+1}, ..., each the prior's answer to the one before (section 4.2; the prior's input
+    /// is the pair mean, log-variance). `start` is the distribution of c_{tau-1}; `each` gets `len` Gaussians of `(B, 1, dim)`.
     ///
     /// # Errors
-    /// If widths differ.
-    pub fn roll_out(&self, start: &Gaussian, len: usize) -> Result<Vec<Gaussian>> {
-        let mut chain: Vec<Gaussian> = Vec::with_capacity(len);
+    /// If widths differ, or `each` fails.
+    pub fn roll_out<V: Value>(&self, start: Gaussian<V>, len: usize, mut each: impl FnMut(&Gaussian<V>) -> Result<()>) -> Result<()> {
+        let mut now = start;
         for _ in 0..len {
-            let next = self.prior.predict(chain.last().unwrap_or(start))?;
-            chain.push(next);
+            now = self.prior.predict(&now)?;
+            each(&now)?;
         }
-        Ok(chain)
+        Ok(())
     }
-}
-
-/// `(B, dim)` tensors to `(B, len, dim)`.
-///
-/// # Errors
-/// If shapes differ.
-pub fn stack_steps(steps: &[Tensor]) -> Result<Tensor> {
-    Tensor::stack(steps, 1)
 }

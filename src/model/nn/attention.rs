@@ -37,7 +37,10 @@ impl CustomOp1 for AttentionOp {
 
     fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
         let plan = self.plan(layout.shape())?;
-        output(plan.forward(slice(storage, layout)?), (plan.batch, plan.steps, plan.heads * plan.head_dim))
+        let width = plan.heads * plan.head_dim;
+        let mut out = vec![0.0; plan.batch * plan.steps * width];
+        plan.forward(slice(storage, layout)?, &mut out);
+        output(out, (plan.batch, plan.steps, width))
     }
 
     fn bwd(&self, qkv: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {

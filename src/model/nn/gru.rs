@@ -1,14 +1,14 @@
 //! The gated recurrent unit, PyTorch's `nn.GRU` of one layer: the whole sequence is one operation with its own way back.
 
 use super::{
-    conv1d::{ConvOp, Grads3},
+    conv1d::{ConvLayer, Grads3},
     host::{grad_like, output, slice, values},
     kernels::{
-        convolution::ConvShape,
         gru::{Gru as Kernel, GruRun},
-        product::Packed,
+        product::{InLine, Packed},
     },
     params::{Init, Params},
+    value::Value,
 };
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
 use std::sync::Arc;
@@ -16,9 +16,8 @@ use std::sync::Arc;
 /// A GRU of one layer; gates in the order r, z, n.
 #[derive(Clone, Debug)]
 pub struct Gru {
-    weight_ih: Tensor,
-    bias_ih: Tensor,
-    inputs: ConvOp,
+    /// Inputs to gates.
+    pub(super) inputs: ConvLayer,
     weight_hh: Tensor,
     bias_hh: Tensor,
     states: GruOp,
@@ -34,25 +33,43 @@ impl Gru {
         let (init, rows) = (Init::FanIn(hidden), 3 * hidden);
         let (weight_ih, weight_hh) = (p.get((rows, d_in), "weight_ih_l0", init)?, p.get((rows, hidden), "weight_hh_l0", init)?);
         let (bias_ih, bias_hh) = (p.get(rows, "bias_ih_l0", init)?, p.get(rows, "bias_hh_l0", init)?);
-        let shape = ConvShape { c_in: d_in, c_out: rows, kernel: 1, stride: 1, padding: 0 };
-        let inputs = ConvOp::gather(shape, p.is_frozen().then_some(&weight_ih))?;
-        let packed = if p.is_frozen() { Some(Arc::new(recurrent_shape(hidden).pack_gather(&values(&weight_hh)?))) } else { None };
-        Ok(Self { weight_ih, bias_ih, inputs, weight_hh, bias_hh, states: GruOp { hidden, packed } })
+        let packed = p.frozen().map(|precision| {
+            let packed = pack(&values(&weight_hh)?, hidden).held_as(precision);
+            Ok::<_, candle_core::Error>(Arc::new((packed, values(&bias_hh)?.to_vec())))
+        });
+        let states = GruOp { hidden, packed: packed.transpose()? };
+        Ok(Self { inputs: ConvLayer::linear(weight_ih, bias_ih, p)?, weight_hh, bias_hh, states })
     }
 
-    /// All states, `(B, L, H)`, from inputs `x` `(B, L, d_in)` and initial states `h0` `(B, H)`.
+    /// All states, `(B, L, H)`, from inputs `x` `(B, L, d_in)`; the state before the first is zero where none is given: `(B, H)`.
     ///
     /// # Errors
-    /// If the shapes of `x` and `h0` do not fit each other and the layer.
-    pub fn forward(&self, x: &Tensor, h0: &Tensor) -> Result<Tensor> {
-        let (batch, _, _) = x.dims3()?;
-        if h0.dims2()? != (batch, self.states.hidden) {
-            candle_core::bail!("a GRU of {} units on a batch of {batch} got initial states {:?}", self.states.hidden, h0.shape());
-        }
-        let projected = self.inputs.apply(x, &self.weight_ih, &self.bias_ih)?;
+    /// If the shapes of `x` and `before` do not fit each other and the layer.
+    pub fn forward<V: Value>(&self, x: &V, before: Option<&V>) -> Result<V> {
+        x.gru(self, before)
+    }
+
+    /// Size of the state.
+    pub fn hidden(&self) -> usize {
+        self.states.hidden
+    }
+
+    /// The recurrence on candle's tensors, with a way back.
+    pub(super) fn apply(&self, projected: &Tensor, before: &Tensor) -> Result<Tensor> {
         // candle's operations take three tensors, so weight and bias go as one, rows in a line.
         let recurrent = join_columns(&self.weight_hh, &self.bias_hh)?;
-        projected.apply_op3(&h0.contiguous()?, &recurrent, self.states.clone())
+        projected.apply_op3(&before.contiguous()?, &recurrent, self.states.clone())
+    }
+
+    /// The recurrence on plain numbers of `batch` sequences.
+    pub(super) fn run(&self, projected: &[f32], before: &[f32], batch: usize, out: &mut [f32]) -> Result<()> {
+        let hidden = self.states.hidden;
+        let work = Kernel { batch, steps: projected.len() / (3 * hidden * batch).max(1), hidden };
+        match &self.states.packed {
+            Some(packed) => work.forward(projected, before, (&packed.0, &packed.1), out),
+            None => work.forward(projected, before, (&pack(&values(&self.weight_hh)?, hidden), &values(&self.bias_hh)?), out),
+        }
+        Ok(())
     }
 }
 
@@ -61,15 +78,16 @@ fn join_columns(weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
     Tensor::cat(&[&weight.flatten_all()?, bias], 0)
 }
 
-fn recurrent_shape(hidden: usize) -> ConvShape {
-    ConvShape { c_in: hidden, c_out: 3 * hidden, kernel: 1, stride: 1, padding: 0 }
+/// The recurrent weight `(3H, H)`, transposed.
+fn pack(weight: &[f32], hidden: usize) -> Packed {
+    Packed::new(weight, (InLine, hidden), (3 * hidden, hidden))
 }
 
 /// The recurrence as an operation on (projected inputs, initial states, weight and bias in a line).
 #[derive(Clone, Debug)]
 struct GruOp {
     hidden: usize,
-    packed: Option<Arc<Packed>>,
+    packed: Option<Arc<(Packed, Vec<f32>)>>,
 }
 
 impl GruOp {
@@ -95,15 +113,12 @@ impl CustomOp3 for GruOp {
     ) -> Result<(CpuStorage, Shape)> {
         let (plan, initial) = (self.plan(l1.shape())?, slice(s2, l2)?);
         let (weight, bias) = slice(s3, l3)?.split_at(3 * self.hidden * self.hidden);
-        let fresh;
-        let packed = match &self.packed {
-            Some(packed) => packed.as_ref(),
-            None => {
-                fresh = recurrent_shape(self.hidden).pack_gather(weight);
-                &fresh
-            }
-        };
-        output(plan.forward(slice(s1, l1)?, initial, packed, bias), (plan.batch, plan.steps, self.hidden))
+        let mut out = vec![0.0; plan.batch * plan.steps * self.hidden];
+        match &self.packed {
+            Some(packed) => plan.forward(slice(s1, l1)?, initial, (&packed.0, &packed.1), &mut out),
+            None => plan.forward(slice(s1, l1)?, initial, (&pack(weight, self.hidden), bias), &mut out),
+        }
+        output(out, (plan.batch, plan.steps, self.hidden))
     }
 
     fn bwd(&self, x: &Tensor, h0: &Tensor, recurrent: &Tensor, states: &Tensor, grad: &Tensor) -> Result<Grads3> {

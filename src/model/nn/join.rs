@@ -1,28 +1,47 @@
 //! Joining activations without candle's slow ways round (broadcasts that materialise, zero-padded gradients of `cat`).
 
 use super::{
+    conv1d::Grads3,
     host::{grad_like, output, slice, values},
-    kernels::join,
+    kernels::join::{self, Columns},
 };
-use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor};
 
-/// `x[b, t, c] + e[b, c]`: `(B, T, C)` and `(B, C)` to `(B, T, C)`.
-///
-/// # Errors
-/// If the shapes do not fit each other.
-pub fn add_channel_bias(x: &Tensor, e: &Tensor) -> Result<Tensor> {
+/// `x[b, t, c] + e[b, 0, c]`: `(B, T, C)` and `(B, 1, C)` to `(B, T, C)`.
+pub(super) fn add_at_each_step(x: &Tensor, e: &Tensor) -> Result<Tensor> {
     let (batch, _, channels) = x.dims3()?;
-    if e.dims2()? != (batch, channels) {
+    if e.dims3()? != (batch, 1, channels) {
         candle_core::bail!("cannot add {:?} over the steps of {:?}", e.shape(), x.shape());
     }
-    x.contiguous()?.apply_op2(&e.contiguous()?, AddChannelBias)
+    x.contiguous()?.apply_op2(&e.contiguous()?, AddAtEachStep)
+}
+
+/// See [`super::Value::modulated`].
+pub(super) fn modulate(x: &Tensor, ada: &Tensor, part: usize) -> Result<Tensor> {
+    check_chunks(x, ada, part + 2)?;
+    x.contiguous()?.apply_op2(&ada.contiguous()?, Modulate { part })
+}
+
+/// See [`super::Value::plus_gated`].
+pub(super) fn add_gated(x: &Tensor, h: &Tensor, ada: &Tensor, part: usize) -> Result<Tensor> {
+    check_chunks(x, ada, part + 1)?;
+    if h.shape() != x.shape() {
+        candle_core::bail!("cannot add {:?} to {:?}", h.shape(), x.shape());
+    }
+    x.contiguous()?.apply_op3(&h.contiguous()?, &ada.contiguous()?, AddGated { part })
+}
+
+/// Whether the rows of `ada` hold `parts` chunks as wide as the rows of `x`.
+fn check_chunks(x: &Tensor, ada: &Tensor, parts: usize) -> Result<()> {
+    let ((batch, steps, channels), (ada_batch, ada_steps, width)) = (x.dims3()?, ada.dims3()?);
+    if (batch, steps) != (ada_batch, ada_steps) || parts * channels > width {
+        candle_core::bail!("{:?} does not hold {parts} chunks for {:?}", ada.shape(), x.shape());
+    }
+    Ok(())
 }
 
 /// Tensors of the same leading dimensions side by side along the last one.
-///
-/// # Errors
-/// If there is none, or their leading dimensions differ.
-pub fn concat_channels(tensors: &[&Tensor]) -> Result<Tensor> {
+pub(super) fn concat_channels(tensors: &[&Tensor]) -> Result<Tensor> {
     let Some((first, rest)) = tensors.split_first() else { candle_core::bail!("nothing to concatenate") };
     let mut joined = first.contiguous()?;
     for next in rest {
@@ -38,11 +57,11 @@ pub fn concat_channels(tensors: &[&Tensor]) -> Result<Tensor> {
 /// Gradients to two arguments.
 type Grads2 = (Option<Tensor>, Option<Tensor>);
 
-struct AddChannelBias;
+struct AddAtEachStep;
 
-impl CustomOp2 for AddChannelBias {
+impl CustomOp2 for AddAtEachStep {
     fn name(&self) -> &'static str {
-        "add_channel_bias"
+        "add_at_each_step"
     }
 
     fn cpu_fwd(&self, s1: &CpuStorage, l1: &Layout, s2: &CpuStorage, l2: &Layout) -> Result<(CpuStorage, Shape)> {
@@ -77,7 +96,11 @@ impl CustomOp2 for Concat {
         let mut dims = l1.dims().to_vec();
         let (last, widths) = (dims.len() - 1, [l1, l2].map(|layout| layout.dims()[layout.dims().len() - 1]));
         dims[last] = widths[0] + widths[1];
-        output(join::concat(slice(s1, l1)?, slice(s2, l2)?, widths), dims)
+        let (a, b, width) = (slice(s1, l1)?, slice(s2, l2)?, dims[last]);
+        let mut out = vec![0.0; a.len() + b.len()];
+        join::copy_columns(a, widths[0], (&mut out, width), widths[0]);
+        join::copy_columns(b, widths[1], (&mut out[widths[0].min(a.len())..], width), widths[1]);
+        output(out, dims)
     }
 
     fn bwd(&self, a: &Tensor, b: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Grads2> {
@@ -86,5 +109,71 @@ impl CustomOp2 for Concat {
         let [da, db] = join::split(&values(&grad)?, widths);
         let keep = |values, like: &Tensor| if like.track_op() { grad_like(values, like) } else { Ok(None) };
         Ok((keep(da, a)?, keep(db, b)?))
+    }
+}
+
+/// `x (1 + scale) + shift` as an operation on (x, ada).
+struct Modulate {
+    part: usize,
+}
+
+/// `x + gate h` as an operation on (x, h, ada).
+struct AddGated {
+    part: usize,
+}
+
+/// Channels of `(.., channels)`.
+fn last(dims: &[usize]) -> usize {
+    dims.last().copied().unwrap_or(0)
+}
+
+impl CustomOp2 for Modulate {
+    fn name(&self) -> &'static str {
+        "modulate"
+    }
+
+    fn cpu_fwd(&self, s1: &CpuStorage, l1: &Layout, s2: &CpuStorage, l2: &Layout) -> Result<(CpuStorage, Shape)> {
+        let (mut out, channels) = (slice(s1, l1)?.to_vec(), last(l1.dims()));
+        join::modulate(&mut out, Columns { values: slice(s2, l2)?, width: last(l2.dims()), from: self.part * channels }, channels);
+        output(out, l1.shape())
+    }
+
+    fn bwd(&self, x: &Tensor, ada: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Grads2> {
+        let (grad, channels) = (grad.contiguous()?, last(x.dims()));
+        let (held_x, held_ada) = (values(x)?, values(ada)?);
+        let columns = Columns { values: &held_ada, width: last(ada.dims()), from: self.part * channels };
+        let (mut dx, mut d_ada) = (values(&grad)?.to_vec(), vec![0.0; ada.elem_count()]);
+        join::modulate_back(&held_x, &mut dx, columns, &mut d_ada, channels);
+        Ok((grad_like(dx, x)?, grad_like(d_ada, ada)?))
+    }
+}
+
+impl CustomOp3 for AddGated {
+    fn name(&self) -> &'static str {
+        "add_gated"
+    }
+
+    fn cpu_fwd(
+        &self,
+        s1: &CpuStorage,
+        l1: &Layout,
+        s2: &CpuStorage,
+        l2: &Layout,
+        s3: &CpuStorage,
+        l3: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (mut out, channels) = (slice(s1, l1)?.to_vec(), last(l1.dims()));
+        let ada = Columns { values: slice(s3, l3)?, width: last(l3.dims()), from: self.part * channels };
+        join::add_gated(&mut out, slice(s2, l2)?, ada, channels);
+        output(out, l1.shape())
+    }
+
+    fn bwd(&self, x: &Tensor, h: &Tensor, ada: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Grads3> {
+        let (grad, channels) = (grad.contiguous()?, last(x.dims()));
+        let (held_h, held_ada) = (values(h)?, values(ada)?);
+        let columns = Columns { values: &held_ada, width: last(ada.dims()), from: self.part * channels };
+        let (mut dh, mut d_ada) = (values(&grad)?.to_vec(), vec![0.0; ada.elem_count()]);
+        join::add_gated_back(&held_h, &mut dh, columns, &mut d_ada, channels);
+        Ok((Some(grad), grad_like(dh, h)?, grad_like(d_ada, ada)?))
     }
 }

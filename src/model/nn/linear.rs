@@ -1,19 +1,15 @@
 //! The fully connected layer, PyTorch's `nn.Linear`.
 
 use super::{
-    conv1d::ConvOp,
-    kernels::convolution::ConvShape,
+    conv1d::ConvLayer,
     params::{Init, Params},
+    value::Value,
 };
-use candle_core::{Result, Tensor};
+use candle_core::Result;
 
 /// `y = x W^T + b` over the last dimension.
 #[derive(Clone, Debug)]
-pub struct Linear {
-    weight: Tensor,
-    bias: Tensor,
-    op: ConvOp,
-}
+pub struct Linear(ConvLayer);
 
 impl Linear {
     /// `weight` `(d_out, d_in)` and `bias` `(d_out)`, both uniform in `+-1/sqrt(d_in)` when fresh.
@@ -30,16 +26,14 @@ impl Linear {
     /// Those of [`Params::get`].
     pub fn with_init(d_in: usize, d_out: usize, weight: Init, bias: Init, p: &Params) -> Result<Self> {
         let (weight, bias) = (p.get((d_out, d_in), "weight", weight)?, p.get(d_out, "bias", bias)?);
-        let shape = ConvShape { c_in: d_in, c_out: d_out, kernel: 1, stride: 1, padding: 0 };
-        let op = ConvOp::gather(shape, p.is_frozen().then_some(&weight))?;
-        Ok(Self { weight, bias, op })
+        ConvLayer::linear(weight, bias, p).map(Self)
     }
 
     /// `(.., d_in)` to `(.., d_out)`.
     ///
     /// # Errors
     /// If the last dimension of `x` is not `d_in`.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        self.op.apply(x, &self.weight, &self.bias)
+    pub fn forward<V: Value>(&self, x: &V) -> Result<V> {
+        x.conv(&self.0)
     }
 }

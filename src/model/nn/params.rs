@@ -1,5 +1,6 @@
 //! Named parameters: where a network gets its weights from, fresh (seeded) or loaded (checked).
 
+use super::kernels::product::Precision;
 use crate::model::noise::Philox;
 use candle_core::{DType, Device, Result, Shape, Tensor, Var};
 use std::{
@@ -20,7 +21,7 @@ pub enum Init {
 
 enum Source {
     Fresh { seed: u64, vars: BTreeMap<String, Var> },
-    Loaded { tensors: BTreeMap<String, Tensor>, used: BTreeSet<String> },
+    Loaded { tensors: BTreeMap<String, Tensor>, used: BTreeSet<String>, precision: Precision },
 }
 
 /// A scope in a parameter store: `params.scope("down").scope("0").get(&[32, 23, 5], "weight", init)` is the tensor `down.0.weight`.
@@ -41,7 +42,12 @@ impl Params {
 
     /// A store of constants, by full name.
     pub fn loaded(tensors: BTreeMap<String, Tensor>) -> Self {
-        Self { source: Arc::new(Mutex::new(Source::Loaded { tensors, used: BTreeSet::new() })), prefix: String::new() }
+        Self::loaded_as(tensors, Precision::F32)
+    }
+
+    /// A store of constants whose weight matrices are held with this precision; biases and norms stay as they are.
+    pub fn loaded_as(tensors: BTreeMap<String, Tensor>, precision: Precision) -> Self {
+        Self { source: Arc::new(Mutex::new(Source::Loaded { tensors, used: BTreeSet::new(), precision })), prefix: String::new() }
     }
 
     /// The same store, one name deeper.
@@ -50,9 +56,12 @@ impl Params {
         Self { source: self.source.clone(), prefix }
     }
 
-    /// Whether the parameters are constants (inference), so that a layer may pack them at construction.
-    pub fn is_frozen(&self) -> bool {
-        matches!(*self.lock(), Source::Loaded { .. })
+    /// If the parameters are constants (inference), so that a layer may pack them at construction: how it is to hold its weights.
+    pub fn frozen(&self) -> Option<Precision> {
+        match &*self.lock() {
+            Source::Fresh { .. } => None,
+            Source::Loaded { precision, .. } => Some(*precision),
+        }
     }
 
     /// The parameter `name` of this scope with this shape.
@@ -71,7 +80,7 @@ impl Params {
                 vars.insert(name, var);
                 Ok(tensor)
             }
-            Source::Loaded { tensors, used } => {
+            Source::Loaded { tensors, used, .. } => {
                 let tensor = tensors.get(&name).ok_or_else(|| candle_core::Error::Msg(format!("tensor {name} is missing")))?;
                 if *tensor.shape() != shape || tensor.dtype() != DType::F32 {
                     candle_core::bail!("tensor {name} is {:?} {:?}, expected F32 {shape:?}", tensor.dtype(), tensor.shape());
@@ -94,7 +103,7 @@ impl Params {
     pub fn unused(&self) -> Vec<String> {
         match &*self.lock() {
             Source::Fresh { .. } => Vec::new(),
-            Source::Loaded { tensors, used } => tensors.keys().filter(|name| !used.contains(*name)).cloned().collect(),
+            Source::Loaded { tensors, used, .. } => tensors.keys().filter(|name| !used.contains(*name)).cloned().collect(),
         }
     }
 

@@ -1,6 +1,12 @@
 //! Every layer against central differences, on odd shapes, on strided input, by row, and with every instruction set.
 
-use super::{testing::*, *};
+use super::{
+    Activation::{GeluTanh, Mish, Relu, Silu},
+    attention::attention,
+    join::concat_channels,
+    testing::*,
+    *,
+};
 use candle_core::{Result, Tensor};
 use std::collections::BTreeMap;
 
@@ -18,7 +24,7 @@ fn layers() -> Vec<(&'static str, Tensor, Layer)> {
     let conv = |c_in, c_out, kernel, stride, padding| ConvShape { c_in, c_out, kernel, stride, padding };
     let convolution = |shape| -> Layer { Box::new(move |x, p| Conv1d::new(shape, p)?.forward(x)) };
     let transpose = |shape| -> Layer { Box::new(move |x, p| ConvTranspose1d::new(shape, p)?.forward(x)) };
-    let group_norm = |groups, channels| -> Layer { Box::new(move |x, p| GroupNormMish::new(groups, channels, p)?.forward(x)) };
+    let group_norm = |groups, channels| -> Layer { Box::new(move |x, p| GroupNormMish::new(groups, channels, p)?.forward(x.clone())) };
     let layer_norm = |affine| -> Layer { Box::new(move |x, p| LayerNorm::new(19, affine, 1e-6, p)?.forward(x)) };
     vec![
         ("linear", gaussian(1, (7, 5)), Box::new(|x, p| Linear::new(5, 67, p)?.forward(x))),
@@ -90,7 +96,7 @@ fn frozen_weights_give_the_same_bits() {
 fn gru(inputs: &[Tensor]) -> Result<Tensor> {
     let names = ["bias_hh_l0", "bias_ih_l0", "weight_hh_l0", "weight_ih_l0"];
     let named = names.iter().map(|name| (*name).to_owned()).zip(inputs[2..].iter().cloned()).collect();
-    Gru::new(3, 5, &Params::loaded(named))?.forward(&inputs[0], &inputs[1])
+    Gru::new(3, 5, &Params::loaded(named))?.forward(&inputs[0], Some(&inputs[1]))
 }
 
 #[test]
@@ -106,9 +112,9 @@ fn gru_against_central_differences() {
 #[test]
 fn gru_packed_once_gives_the_same_bits() {
     let (x, h0, fresh) = (gaussian(1, (2, 3, 4)), gaussian(2, (2, 20)), Params::fresh(5));
-    let y = Gru::new(4, 20, &fresh).unwrap().forward(&x, &h0).unwrap();
+    let y = Gru::new(4, 20, &fresh).unwrap().forward(&x, Some(&h0)).unwrap();
     let frozen = Params::loaded(fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().copy().unwrap())).collect());
-    assert_eq!(bits(&Gru::new(4, 20, &frozen).unwrap().forward(&x, &h0).unwrap()), bits(&y));
+    assert_eq!(bits(&Gru::new(4, 20, &frozen).unwrap().forward(&x, Some(&h0)).unwrap()), bits(&y));
 }
 
 #[test]
@@ -123,23 +129,26 @@ fn attention_against_central_differences() {
 
 #[test]
 fn joins_against_central_differences() {
-    let (x, e, y) = (gaussian(1, (2, 3, 5)), gaussian(2, (2, 5)), gaussian(3, (2, 3, 4)));
-    check_gradients(&[x.clone(), e.clone()], &|inputs| add_channel_bias(&inputs[0], &inputs[1]));
+    let (x, e, y) = (gaussian(1, (2, 3, 5)), gaussian(2, (2, 1, 5)), gaussian(3, (2, 3, 4)));
+    let (h, ada) = (gaussian(4, (2, 3, 5)), gaussian(5, (2, 3, 20)));
+    check_gradients(&[x.clone(), e.clone()], &|inputs| inputs[0].clone().plus_at_each_step(&inputs[1]));
+    check_gradients(&[x.clone(), ada.clone()], &|inputs| inputs[0].clone().modulated(&inputs[1], 2));
+    check_gradients(&[x.clone(), h, ada], &|inputs| inputs[0].clone().plus_gated(&inputs[1], &inputs[2], 3));
     check_gradients(&[x.clone(), y.clone()], &|inputs| concat_channels(&[&inputs[0], &inputs[1], &inputs[0]]));
     let expected = Tensor::cat(&[&x, &y], 2).unwrap();
     assert_eq!(bits(&concat_channels(&[&x, &y]).unwrap()), bits(&expected));
-    let expected = x.broadcast_add(&e.unsqueeze(1).unwrap()).unwrap();
-    assert_eq!(bits(&add_channel_bias(&scrambled(&x, 0, 2), &e).unwrap()), bits(&expected));
+    let expected = x.broadcast_add(&e).unwrap();
+    assert_eq!(bits(&scrambled(&x, 0, 2).plus_at_each_step(&e).unwrap()), bits(&expected));
 }
 
 #[test]
 fn activations_against_central_differences() {
-    for activation in [mish, silu, gelu_tanh, relu] {
+    for activation in [Mish, Silu, GeluTanh, Relu] {
         // No value within a step of relu's corner.
         let x = gaussian(1, (3, 11)).affine(1.0, 0.0).unwrap();
         let away = x.abs().unwrap().ge(0.02).unwrap().where_cond(&x, &x.ones_like().unwrap()).unwrap();
-        check_gradients(std::slice::from_ref(&away), &|inputs| activation(&inputs[0]));
-        check_rows(&[away], &|inputs| activation(&inputs[0]));
+        check_gradients(std::slice::from_ref(&away), &|inputs| inputs[0].clone().activated(activation));
+        check_rows(&[away], &|inputs| inputs[0].clone().activated(activation));
     }
 }
 
@@ -147,8 +156,8 @@ fn activations_against_central_differences() {
 #[test]
 fn gradients_far_out_are_finite() {
     let x = Tensor::new(&[-1e4_f32, -89.0, -20.5, 20.5, 89.0, 1e4], &candle_core::Device::Cpu).unwrap();
-    for activation in [mish, silu, gelu_tanh, relu] {
-        let grad = gradients(std::slice::from_ref(&x), &|inputs| activation(&inputs[0]));
+    for activation in [Mish, Silu, GeluTanh, Relu] {
+        let grad = gradients(std::slice::from_ref(&x), &|inputs| inputs[0].clone().activated(activation));
         assert!(flat(&grad[0]).iter().all(|grad| grad.is_finite()));
     }
 }
@@ -164,7 +173,8 @@ fn wrong_shapes_are_errors() {
     assert!(LayerNorm::new(8, true, 1e-5, &p.scope("norm")).unwrap().forward(&gaussian(1, (2, 4))).is_err());
     assert!(attention(&gaussian(1, (2, 4, 8)), 2).is_err());
     assert!(concat_channels(&[&gaussian(1, (2, 4, 8)), &gaussian(1, (2, 3, 8))]).is_err());
-    assert!(add_channel_bias(&gaussian(1, (2, 4, 8)), &gaussian(1, (2, 7))).is_err());
+    assert!(gaussian(1, (2, 4, 8)).plus_at_each_step(&gaussian(1, (2, 1, 7))).is_err());
+    assert!(gaussian(1, (2, 4, 8)).modulated(&gaussian(1, (2, 4, 16)), 1).is_err());
 }
 
 /// `tests/golden/make_nn.py` tells how PyTorch made these numbers, in float64.
@@ -179,21 +189,23 @@ fn layers_against_pytorch() {
         ("conv", Box::new(move |x, p| Conv1d::new(conv(20, 5, 1, 2), p)?.forward(x))),
         ("conv_stride", Box::new(move |x, p| Conv1d::new(conv(10, 3, 2, 1), p)?.forward(x))),
         ("conv_transpose", Box::new(move |x, p| ConvTranspose1d::new(conv(10, 4, 2, 1), p)?.forward(x))),
-        ("group_norm_mish", Box::new(|x, p| GroupNormMish::new(4, 20, p)?.forward(x))),
+        ("group_norm_mish", Box::new(|x, p| GroupNormMish::new(4, 20, p)?.forward(x.clone()))),
         ("layer_norm", Box::new(|x, p| LayerNorm::new(21, true, 1e-5, p)?.forward(x))),
         ("layer_norm_plain", Box::new(|x, p| LayerNorm::new(21, false, 1e-6, p)?.forward(x))),
         ("attention", single(|x| attention(x, 2))),
-        ("mish", single(mish)),
-        ("silu", single(silu)),
-        ("gelu_tanh", single(gelu_tanh)),
-        ("relu", single(relu)),
+        ("mish", single(|x| x.clone().activated(Mish))),
+        ("silu", single(|x| x.clone().activated(Silu))),
+        ("gelu_tanh", single(|x| x.clone().activated(GeluTanh))),
+        ("relu", single(|x| x.clone().activated(Relu))),
     ];
     for (name, layer) in cases {
         compare(&golden, name, &["x"], &|inputs, p| layer(&inputs[0], p));
     }
-    compare(&golden, "gru", &["x", "h0"], &|inputs, p| Gru::new(6, 9, p)?.forward(&inputs[0], &inputs[1]));
-    let sinusoid = time_embedding::sinusoid(&golden["sinusoid.x"], 32).unwrap();
-    assert!(distance(&flat(&sinusoid), &flat(&golden["sinusoid.y"])) < 1e-6);
+    compare(&golden, "gru", &["x", "h0"], &|inputs, p| Gru::new(6, 9, p)?.forward(&inputs[0], Some(&inputs[1])));
+    let sinusoid = time_embedding::Sinusoid::new(32, 100).unwrap();
+    let mut rows = vec![0.0; golden["sinusoid.y"].elem_count()];
+    flat(&golden["sinusoid.x"]).iter().zip(rows.chunks_exact_mut(32)).for_each(|(level, row)| sinusoid.write(*level, row));
+    assert!(distance(&rows, &flat(&golden["sinusoid.y"])) < 1e-6);
 }
 
 /// Result and every gradient of one golden case, within a few roundings.

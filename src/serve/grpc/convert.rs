@@ -73,7 +73,7 @@ pub fn list_request(request: pb::ListSessionsRequest) -> ListRequest {
 pub fn act_response(acted: &Acted) -> pb::ActResponse {
     let Acted { answer, replayed, want_planned_states } = acted;
     let Answer { session, step, chunk, timings, model, model_digest } = &**answer;
-    let Chunk { actions, planned_states, latent_mean, latent_log_var, predicted_state, evaluations, start } = chunk;
+    let Chunk { actions, planned_states, latent_mean, latent_log_var, predicted_state, evaluations, start, degraded } = chunk;
     let (start, renoised_rungs) = self::start(*start);
     pb::ActResponse {
         session_id: session.to_string(),
@@ -90,7 +90,7 @@ pub fn act_response(acted: &Acted) -> pb::ActResponse {
         timings: Some(self::timings(timings)),
         model: model.to_string(),
         model_digest: model_digest.clone(),
-        degraded: false,
+        degraded: *degraded,
     }
 }
 

@@ -56,7 +56,7 @@ impl From<&Acted> for ActAnswer {
     fn from(acted: &Acted) -> Self {
         let Acted { answer, replayed, want_planned_states } = acted;
         let Answer { session, step, chunk, timings, model, model_digest } = &**answer;
-        let Chunk { actions, planned_states, latent_mean, latent_log_var, predicted_state, evaluations, start } = chunk.clone();
+        let Chunk { actions, planned_states, latent_mean, latent_log_var, predicted_state, evaluations, start, degraded } = chunk.clone();
         let (start, renoised_rungs) = match start {
             Start::Cold => ("cold", 0),
             Start::Warm => ("warm", 0),
@@ -77,7 +77,7 @@ impl From<&Acted> for ActAnswer {
             timings: timings.into(),
             model: model.to_string(),
             model_digest: model_digest.clone(),
-            degraded: false,
+            degraded,
         }
     }
 }

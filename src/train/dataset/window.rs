@@ -3,9 +3,9 @@
 use super::Episode;
 use crate::model::{
     diffusion::refine::WindowBatch,
-    latent::elbo::ElboBatch,
+    latent::{Tokens, elbo::ElboBatch},
     noise::Philox,
-    trajectory::{Layout, Tokens},
+    trajectory::Layout,
 };
 use candle_core::{Device, Result, Tensor};
 
@@ -204,7 +204,7 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
     let noise: Vec<f32> = (0..window.len()).map(|_| rng.normal()).collect();
     let observed = match shape.obs_horizon {
         0 | 1 => None,
-        real => Some(Tensor::from_vec(observed, (shape.batch, (real - 1) * layout.dim()), &Device::Cpu)?),
+        real => Some(Tensor::from_vec(observed, (shape.batch, 1, (real - 1) * layout.dim()), &Device::Cpu)?),
     };
     Ok(WindowBatch {
         history: history.tokens(shape.block_len)?,
@@ -291,7 +291,7 @@ mod tests {
             WindowShape { batch: 300, plan_horizon: 4, block_len: 3, obs_horizon: 3, sub_steps: 2, action_horizon: 3, ready_fraction: 0.5 };
         let batch = windows(&episodes, &shape.places(&episodes), &shape, None, &mut Philox::new(2)).unwrap();
         let (window, history) = (rows(&batch.window), rows(&batch.history.state));
-        let (present, observed) = (rows(&batch.history.present), batch.observed.unwrap().to_vec2::<f32>().unwrap());
+        let (present, observed) = (rows(&batch.history.present), batch.observed.unwrap().squeeze(1).unwrap().to_vec2::<f32>().unwrap());
         let mut imagined_counts = [0; 3];
         for row in 0..shape.batch {
             let first = window[row][0][0];

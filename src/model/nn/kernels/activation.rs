@@ -16,13 +16,13 @@ pub enum Activation {
 }
 
 per_isa! {
-    /// `out[i] = f(x[i])`.
-    pub fn forward(kind: Activation, x: &[f32], out: &mut [f32]) {
+    /// `x[i] = f(x[i])`.
+    pub fn in_place(kind: Activation, x: &mut [f32]) {
         match kind {
-            Activation::Mish => out.iter_mut().zip(x).for_each(|(out, &x)| *out = math::mish(x)),
-            Activation::Silu => out.iter_mut().zip(x).for_each(|(out, &x)| *out = math::silu(x)),
-            Activation::GeluTanh => out.iter_mut().zip(x).for_each(|(out, &x)| *out = math::gelu(x)),
-            Activation::Relu => out.iter_mut().zip(x).for_each(|(out, &x)| *out = if x < 0.0 { 0.0 } else { x }),
+            Activation::Mish => x.iter_mut().for_each(|x| *x = math::mish(*x)),
+            Activation::Silu => x.iter_mut().for_each(|x| *x = math::silu(*x)),
+            Activation::GeluTanh => x.iter_mut().for_each(|x| *x = math::gelu(*x)),
+            Activation::Relu => x.iter_mut().for_each(|x| *x = if *x < 0.0 { 0.0 } else { *x }),
         }
     }
 }

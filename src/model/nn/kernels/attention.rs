@@ -3,9 +3,9 @@
 //! Nothing of size steps x steps outlives a head of an item: backward computes the weights again.
 
 use super::{
-    convolution::every,
     math, per_isa,
-    product::{Packed, Rows, Start, product},
+    pool::Pooled,
+    product::{Every, InLine, Left, Packed, Start, even_rows, product},
 };
 
 /// Sizes of an attention.
@@ -40,21 +40,21 @@ struct Matrix<'a> {
 
 impl Matrix<'_> {
     fn pack(&self) -> Packed {
-        Packed::new(self.values, &every(self.stride, self.rows), self.columns, 1)
+        Packed::scratch(self.values, (Every(self.stride), self.rows), (self.columns, 1))
     }
 
     fn pack_transposed(&self) -> Packed {
-        Packed::new(self.values, &every(1, self.columns), self.rows, self.stride)
+        Packed::scratch(self.values, (InLine, self.columns), (self.rows, self.stride))
     }
 
     fn times(&self, b: &Packed, out: &mut [f32], out_stride: usize) {
-        let (row_offset, k_offset) = (every(self.stride, self.rows), every(1, self.columns));
-        product(Rows { values: self.values, row_offset: &row_offset, k_offset: &k_offset }, b, Start::Zero, out, out_stride);
+        let rows = even_rows(self.rows, self.stride, out_stride, self.columns);
+        product(Left { values: self.values, terms: InLine }, b, Start::Zero, out, rows);
     }
 
     fn transposed_times(&self, b: &Packed, out: &mut [f32], out_stride: usize) {
-        let (row_offset, k_offset) = (every(1, self.columns), every(self.stride, self.rows));
-        product(Rows { values: self.values, row_offset: &row_offset, k_offset: &k_offset }, b, Start::Zero, out, out_stride);
+        let rows = even_rows(self.columns, 1, out_stride, self.rows);
+        product(Left { values: self.values, terms: Every(self.stride) }, b, Start::Zero, out, rows);
     }
 }
 
@@ -115,23 +115,21 @@ impl Attention {
         softmax(weights, self.steps, self.scale());
     }
 
-    /// `(batch, steps, width)` from `(batch, steps, 3 width)`.
-    pub fn forward(&self, qkv: &[f32]) -> Vec<f32> {
-        let mut out = vec![0.0; self.batch * self.steps * self.width()];
-        let mut weights = vec![0.0; self.steps * self.steps];
+    /// `(batch, steps, width)` into `out` from `(batch, steps, 3 width)`.
+    pub fn forward(&self, qkv: &[f32], out: &mut [f32]) {
+        let mut weights = Pooled::take(self.steps * self.steps);
         for at in self.each_head() {
             self.weights(qkv, at, &mut weights);
             let values = self.part(qkv, at, Part::Value).pack();
             let corner = at.0 * self.steps * self.width() + at.1 * self.head_dim;
             self.square(&weights).times(&values, &mut out[corner..], self.width());
         }
-        out
     }
 
     /// The gradient to `qkv` from `grad`, the gradient to the result.
     pub fn backward(&self, qkv: &[f32], grad: &[f32]) -> Vec<f32> {
         let mut out = vec![0.0; qkv.len()];
-        let (mut weights, mut scores) = (vec![0.0; self.steps * self.steps], vec![0.0; self.steps * self.steps]);
+        let (mut weights, mut scores) = (Pooled::take(self.steps * self.steps), Pooled::take(self.steps * self.steps));
         let stride = 3 * self.width();
         for at in self.each_head() {
             self.weights(qkv, at, &mut weights);

@@ -2,11 +2,17 @@
 //!
 //! The transposed convolution is [`Convolution::spread`], the map from the gradient of the result to the gradient of the input;
 //! its own backward is then the other two maps. So three maps serve both layers in both directions.
+//!
+//! Terms of a chain stand in the order (tap, channel): the window of an output is then one piece of the padded input. Rows are taken
+//! in the order (time, item), so that a tile of a large batch holds rows of the same time, and skips the taps that fall on padding:
+//! with 2 steps, 3 of 5 taps at either end.
 
 use super::{
     join,
-    product::{Packed, Rows, Start, product},
+    pool::Pooled,
+    product::{Every, InLine, Left, Packed, Precision, Row, Start, Table, even_rows, product},
 };
+use std::ops::Range;
 
 /// Channels, kernel, stride and padding (both ends, zeros) of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,18 +43,35 @@ pub struct Convolution {
     pub narrow_steps: usize,
 }
 
+/// Weights for [`Convolution::spread`]: one product for each phase, the outputs whose place modulo the stride is the same.
+#[derive(Clone, Debug)]
+pub struct Phases(Vec<Packed>);
+
+impl Phases {
+    /// The same weights, held with this precision.
+    #[must_use]
+    pub fn held_as(self, precision: Precision) -> Self {
+        Self(self.0.into_iter().map(|phase| phase.held_as(precision)).collect())
+    }
+}
+
 impl ConvShape {
     /// The weights for [`Convolution::gather`].
     pub fn pack_gather(&self, weight: &[f32]) -> Packed {
         let row = self.c_in * self.kernel;
-        Packed::new(weight, &every(1, row), self.c_out, row)
+        let k_offset: Vec<usize> = (0..self.kernel).flat_map(|tap| (0..self.c_in).map(move |c| c * self.kernel + tap)).collect();
+        Packed::new(weight, (Table(&k_offset), k_offset.len()), (self.c_out, row))
     }
 
-    /// The weights for [`Convolution::spread`]: taps in reverse.
-    pub fn pack_spread(&self, weight: &[f32]) -> Packed {
+    /// The weights for [`Convolution::spread`].
+    pub fn pack_spread(&self, weight: &[f32]) -> Phases {
         let row = self.c_in * self.kernel;
-        let k_offset: Vec<usize> = (0..self.c_out).flat_map(|o| (0..self.kernel).rev().map(move |tap| o * row + tap)).collect();
-        Packed::new(weight, &k_offset, self.c_in, self.kernel)
+        let phase = |residue: usize| {
+            let taps = (residue..self.kernel).step_by(self.stride).rev();
+            let k_offset: Vec<usize> = taps.flat_map(|tap| (0..self.c_out).map(move |o| o * row + tap)).collect();
+            Packed::new(weight, (Table(&k_offset), k_offset.len()), (self.c_in, self.kernel))
+        };
+        Phases((0..self.stride).map(phase).collect())
     }
 
     fn is_pointwise(&self) -> bool {
@@ -61,51 +84,75 @@ fn start(bias: Option<&[f32]>) -> Start<'_> {
     bias.map_or(Start::Zero, Start::Bias)
 }
 
-/// Where a window of `kernel` steps of `channels` holds the terms of a chain: taps within channels, the order of the weights.
-fn window(kernel: usize, channels: usize) -> Vec<usize> {
-    (0..channels).flat_map(|c| (0..kernel).map(move |tap| tap * channels + c)).collect()
-}
-
-/// `0, stride, 2 stride, ...`
-pub fn every(stride: usize, count: usize) -> Vec<usize> {
-    (0..count).map(|i| i * stride).collect()
+/// Those of `taps` taps, at places `first`, `first + 1`, ..., that fall on one of `steps` steps after `front` steps of padding.
+fn inside(first: usize, taps: usize, front: usize, steps: usize) -> Range<usize> {
+    let end = (front + steps).saturating_sub(first).min(taps);
+    front.saturating_sub(first).min(end)..end
 }
 
 impl Convolution {
-    /// The convolution proper: `y[b, t, o] = bias[o] + sum over tap, c of x[b, t stride + tap - padding, c] w[o, c, tap]`.
-    pub fn gather(&self, x: &[f32], weight: &Packed, bias: Option<&[f32]>) -> Vec<f32> {
-        let mut out = vec![0.0; self.batch * self.narrow_steps * self.shape.c_out];
-        let padded = self.padded(x);
-        let (row_offset, k_offset) = (self.window_starts(), window(self.shape.kernel, self.shape.c_in));
-        let rows = Rows { values: padded.as_deref().unwrap_or(x), row_offset: &row_offset, k_offset: &k_offset };
-        product(rows, weight, start(bias), &mut out, self.shape.c_out);
-        out
+    /// The convolution proper: `y[b, t, o] = bias[o] + sum over tap, c of x[b, t stride + tap - padding, c] w[o, c, tap]` into `out`,
+    /// `(batch, narrow_steps, c_out)`.
+    pub fn gather(&self, x: &[f32], weight: &Packed, bias: Option<&[f32]>, out: &mut [f32]) {
+        let ConvShape { c_in, c_out, kernel, stride, padding } = self.shape;
+        if self.shape.is_pointwise() {
+            let rows = even_rows(self.batch * self.narrow_steps, c_in, c_out, c_in);
+            return product(Left { values: x, terms: InLine }, weight, start(bias), out, rows);
+        }
+        let (batch, steps, narrow_steps) = (self.batch, self.padded_steps(), self.narrow_steps);
+        let padded = padded(x, self.wide_steps * c_in, padding * c_in, steps * c_in);
+        let rows = (0..narrow_steps).flat_map(|t| {
+            let taps = inside(t * stride, kernel, padding, self.wide_steps);
+            let terms = taps.start * c_in..taps.end * c_in;
+            (0..batch).map(move |b| Row { from: (b * steps + t * stride) * c_in, to: (b * narrow_steps + t) * c_out, terms: terms.clone() })
+        });
+        product(Left { values: &padded, terms: InLine }, weight, start(bias), out, rows);
     }
 
     /// The transpose of [`Self::gather`] in `x`: `dx[b, s, c] = bias[c] + sum of dy[b, t, o] w[o, c, tap]` over all
-    /// `t stride + tap - padding = s`. It is a convolution of stride 1, taps reversed, over `dy` with zeros in between.
-    pub fn spread(&self, dy: &[f32], weight: &Packed, bias: Option<&[f32]>) -> Vec<f32> {
-        let ConvShape { c_in, c_out, kernel, .. } = self.shape;
-        let mut out = vec![0.0; self.batch * self.wide_steps * c_in];
-        let stuffed = self.stuffed(dy);
-        let steps = self.wide_steps + kernel - 1;
-        let row_offset: Vec<usize> = (0..self.batch).flat_map(|b| (0..self.wide_steps).map(move |s| (b * steps + s) * c_out)).collect();
-        let k_offset = window(kernel, c_out);
-        let rows = Rows { values: stuffed.as_deref().unwrap_or(dy), row_offset: &row_offset, k_offset: &k_offset };
-        product(rows, weight, start(bias), &mut out, c_in);
-        out
+    /// `t stride + tap - padding = s`, into `out`, `(batch, wide_steps, c_in)`. The taps that reach a place are those of its phase,
+    /// and `t` falls as they rise, so each phase is a convolution of stride 1 over `dy`, taps reversed.
+    pub fn spread(&self, dy: &[f32], weight: &Phases, bias: Option<&[f32]>, out: &mut [f32]) {
+        let ConvShape { c_in, c_out, kernel, stride, padding } = self.shape;
+        if self.shape.is_pointwise() {
+            let rows = even_rows(self.batch * self.wide_steps, c_out, c_in, c_out);
+            return product(Left { values: dy, terms: InLine }, &weight.0[0], start(bias), out, rows);
+        }
+        let front = (kernel - 1) / stride;
+        let steps = front + self.narrow_steps.max((self.wide_steps + padding).div_ceil(stride)) + 1;
+        let padded = padded(dy, self.narrow_steps * c_out, front * c_out, steps * c_out);
+        let (batch, wide_steps) = (self.batch, self.wide_steps);
+        for (residue, weight) in weight.0.iter().enumerate() {
+            let taps = weight.terms() / c_out.max(1);
+            let first = (residue + stride - padding % stride) % stride;
+            let rows = (first..wide_steps).step_by(stride).flat_map(|s| {
+                // The last tap of the phase is the one that reaches back farthest.
+                let begin = front + 1 + (s + padding) / stride - taps;
+                let inside = inside(begin, taps, front, self.narrow_steps);
+                let terms = inside.start * c_out..inside.end * c_out;
+                (0..batch).map(move |b| Row { from: (b * steps + begin) * c_out, to: (b * wide_steps + s) * c_in, terms: terms.clone() })
+            });
+            product(Left { values: &padded, terms: InLine }, weight, start(bias), out, rows);
+        }
     }
 
     /// The gradient to the weights: `dw[o, c, tap] = sum over b, t of x[b, t stride + tap - padding, c] dy[b, t, o]`.
     pub fn weight_grad(&self, x: &[f32], dy: &[f32]) -> Vec<f32> {
-        let ConvShape { c_in, c_out, kernel, .. } = self.shape;
-        let padded = self.padded(x);
-        let packed = Packed::new(dy, &every(c_out, self.batch * self.narrow_steps), c_out, 1);
-        let (row_offset, k_offset) = (every(1, kernel * c_in), self.window_starts());
-        let rows = Rows { values: padded.as_deref().unwrap_or(x), row_offset: &row_offset, k_offset: &k_offset };
-        let mut transposed = vec![0.0; kernel * c_in * c_out];
-        product(rows, &packed, Start::Zero, &mut transposed, c_out);
-        join::transpose(&transposed, c_out, &window(kernel, c_in))
+        let ConvShape { c_in, c_out, kernel, padding, .. } = self.shape;
+        let packed = Packed::scratch(dy, (Every(c_out), self.batch * self.narrow_steps), (c_out, 1));
+        let window_starts = self.window_starts();
+        let held;
+        let values = if padding == 0 {
+            x
+        } else {
+            held = padded(x, self.wide_steps * c_in, padding * c_in, self.padded_steps() * c_in);
+            &held
+        };
+        let mut transposed = Pooled::take(kernel * c_in * c_out);
+        let rows = even_rows(kernel * c_in, 1, c_out, packed.terms());
+        product(Left { values, terms: Table(&window_starts) }, &packed, Start::Zero, &mut transposed, rows);
+        let order: Vec<usize> = (0..c_in).flat_map(|c| (0..kernel).map(move |tap| tap * c_in + c)).collect();
+        join::transpose(&transposed, c_out, &order)
     }
 
     /// Steps of a padded window.
@@ -119,35 +166,16 @@ impl Convolution {
         let steps = self.padded_steps();
         (0..self.batch).flat_map(|b| (0..self.narrow_steps).map(move |t| (b * steps + t * stride) * c_in)).collect()
     }
+}
 
-    /// `x` with zeros at both ends of each window, unless it needs none.
-    fn padded(&self, x: &[f32]) -> Option<Vec<f32>> {
-        let ConvShape { c_in, padding, .. } = self.shape;
-        if padding == 0 {
-            return None;
-        }
-        let mut out = vec![0.0; self.batch * self.padded_steps() * c_in];
-        let windows = out.chunks_exact_mut(self.padded_steps() * c_in).zip(x.chunks_exact(self.wide_steps * c_in));
-        windows.for_each(|(out, x)| out[padding * c_in..][..x.len()].copy_from_slice(x));
-        Some(out)
+/// Windows of `len` numbers with `front` zeros before and as many behind as make `whole` of them.
+fn padded(x: &[f32], len: usize, front: usize, whole: usize) -> Pooled {
+    let batch = x.len() / len.max(1);
+    let mut out = Pooled::take(batch * whole);
+    for (out, x) in out.chunks_exact_mut(whole.max(1)).zip(x.chunks_exact(len.max(1))) {
+        out[..front].fill(0.0);
+        out[front..front + len].copy_from_slice(x);
+        out[front + len..].fill(0.0);
     }
-
-    /// `dy` with `stride - 1` zero steps in between and `kernel - 1 - padding` before, cut to `wide_steps + kernel - 1` steps,
-    /// unless it is that already.
-    fn stuffed(&self, dy: &[f32]) -> Option<Vec<f32>> {
-        let ConvShape { c_out, kernel, stride, padding, .. } = self.shape;
-        if self.shape.is_pointwise() {
-            return None;
-        }
-        let steps = self.wide_steps + kernel - 1;
-        let mut out = vec![0.0; self.batch * steps * c_out];
-        for (out, dy) in out.chunks_exact_mut(steps * c_out).zip(dy.chunks_exact(self.narrow_steps * c_out)) {
-            for (t, dy) in dy.chunks_exact(c_out).enumerate() {
-                if let Some(place) = (t * stride + kernel - 1).checked_sub(padding).filter(|&place| place < steps) {
-                    out[place * c_out..][..c_out].copy_from_slice(dy);
-                }
-            }
-        }
-        Some(out)
-    }
+    out
 }

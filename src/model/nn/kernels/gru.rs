@@ -3,9 +3,9 @@
 //! their bias) and `h*` the projected state (with its).
 
 use super::{
-    convolution::every,
     join, math, per_isa,
-    product::{Packed, Rows, Start, product},
+    pool::Pooled,
+    product::{Every, InLine, Left, Packed, Row, Start, even_rows, product},
 };
 
 /// Sizes of a GRU at work.
@@ -100,16 +100,15 @@ per_isa! {
 }
 
 impl Gru {
-    /// All states, `(batch, steps, hidden)`, from projected inputs `x` `(batch, steps, 3 hidden)` and initial states `(batch, hidden)`.
-    /// `weight` is the recurrent weight packed transposed, `(hidden, 3 hidden)`.
-    pub fn forward(&self, x: &[f32], initial: &[f32], weight: &Packed, bias: &[f32]) -> Vec<f32> {
+    /// All states into `out`, `(batch, steps, hidden)`, from projected inputs `x` `(batch, steps, 3 hidden)` and initial states
+    /// `(batch, hidden)`. `weight` is the recurrent weight packed transposed, `(hidden, 3 hidden)`.
+    pub fn forward(&self, x: &[f32], initial: &[f32], (weight, bias): (&Packed, &[f32]), out: &mut [f32]) {
         let (size, row) = (self.hidden, 3 * self.hidden);
-        let mut out = vec![0.0; self.batch * self.steps * size];
-        let (mut state, mut projected) = (initial.to_vec(), vec![0.0; self.batch * row]);
-        let (row_offset, k_offset) = (every(size, self.batch), every(1, size));
+        let (mut state, mut projected) = (Pooled::take(self.batch * size), Pooled::take(self.batch * row));
+        state.copy_from_slice(initial);
         for t in 0..self.steps {
-            let rows = Rows { values: &state, row_offset: &row_offset, k_offset: &k_offset };
-            product(rows, weight, Start::Bias(bias), &mut projected, row);
+            let rows = even_rows(self.batch, size, row, size);
+            product(Left { values: &state, terms: InLine }, weight, Start::Bias(bias), &mut projected, rows);
             for b in 0..self.batch {
                 let at = b * self.steps + t;
                 let next = &mut out[at * size..][..size];
@@ -117,7 +116,6 @@ impl Gru {
                 state[b * size..][..size].copy_from_slice(next);
             }
         }
-        out
     }
 
     /// The state before each step, `(batch, steps, hidden)`.
@@ -135,10 +133,10 @@ impl Gru {
         let (size, row, count) = (self.hidden, 3 * self.hidden, self.batch * self.steps);
         let before = self.states_before(run);
         let mut projected = vec![0.0; count * row];
-        let forward = Packed::new(recurrent.0, &every(1, size), row, size);
-        let (rows, k_offset) = (every(size, count), every(1, size));
-        product(Rows { values: &before, row_offset: &rows, k_offset: &k_offset }, &forward, Start::Bias(recurrent.1), &mut projected, row);
-        let back = Packed::new(recurrent.0, &every(size, row), size, 1);
+        let forward = Packed::scratch(recurrent.0, (InLine, size), (row, size));
+        let rows = even_rows(count, size, row, size);
+        product(Left { values: &before, terms: InLine }, &forward, Start::Bias(recurrent.1), &mut projected, rows);
+        let back = Packed::scratch(recurrent.0, (Every(size), row), (size, 1));
         let (mut inputs, mut dh) = (vec![0.0; count * row], vec![0.0; self.batch * size]);
         for t in (0..self.steps).rev() {
             for b in 0..self.batch {
@@ -148,13 +146,12 @@ impl Gru {
                 let (p, dx) = (&mut projected[at * row..][..row], &mut inputs[at * row..][..row]);
                 step_back(StepBack { x: &run.inputs[at * row..][..row], p, h: &before[at * size..][..size], dx, dh });
             }
-            let row_offset: Vec<usize> = (0..self.batch).map(|b| (b * self.steps + t) * row).collect();
-            let rows = Rows { values: &projected, row_offset: &row_offset, k_offset: &every(1, row) };
-            product(rows, &back, Start::Out, &mut dh, size);
+            let rows = (0..self.batch).map(|b| Row { from: (b * self.steps + t) * row, to: b * size, terms: 0..row });
+            product(Left { values: &projected, terms: InLine }, &back, Start::Out, &mut dh, rows);
         }
         let mut weight = vec![0.0; row * size];
-        let rows = Rows { values: &projected, row_offset: &every(1, row), k_offset: &every(row, count) };
-        product(rows, &Packed::new(&before, &every(size, count), size, 1), Start::Zero, &mut weight, size);
+        let before = Packed::scratch(&before, (Every(size), count), (size, 1));
+        product(Left { values: &projected, terms: Every(row) }, &before, Start::Zero, &mut weight, even_rows(row, 1, size, count));
         let mut bias = vec![0.0; row];
         join::add_rows(&projected, row, &mut bias);
         GruGrads { inputs, initial: dh, weight, bias }

@@ -20,17 +20,87 @@ per_isa! {
     }
 }
 
-/// Rows of `a` (`(rows, widths[0])`) and `b` (`(rows, widths[1])`) side by side.
-pub fn concat(a: &[f32], b: &[f32], widths: [usize; 2]) -> Vec<f32> {
-    let mut out = Vec::with_capacity(a.len() + b.len());
-    for (a, b) in a.chunks_exact(widths[0]).zip(b.chunks_exact(widths[1])) {
-        out.extend_from_slice(a);
-        out.extend_from_slice(b);
+per_isa! {
+    /// `x[i] += y[i]`.
+    pub fn add(x: &mut [f32], y: &[f32]) {
+        x.iter_mut().zip(y).for_each(|(x, y)| *x += y);
     }
-    out
 }
 
-/// The reverse of [`concat()`].
+/// Shift, scale and gate of rows: columns `[from, from + channels)` of each row of `values`, and the `channels` after them.
+#[derive(Clone, Copy, Debug)]
+pub struct Columns<'a> {
+    /// `(rows, width)`.
+    pub values: &'a [f32],
+    /// Width of a row.
+    pub width: usize,
+    /// First column.
+    pub from: usize,
+}
+
+per_isa! {
+    /// `x = x (1 + scale) + shift`, `x` `(rows, channels)`; shift stands at `ada.from`, scale behind it.
+    pub fn modulate(x: &mut [f32], ada: Columns, channels: usize) {
+        for (x, ada_row) in x.chunks_exact_mut(channels).zip(ada.values.chunks_exact(ada.width)) {
+            let (shift, scale) = ada_row[ada.from..ada.from + 2 * channels].split_at(channels);
+            x.iter_mut().zip(shift.iter().zip(scale)).for_each(|(x, (shift, scale))| *x = x.mul_add(scale + 1.0, *shift));
+        }
+    }
+}
+
+per_isa! {
+    /// `x += gate h`, all `(rows, channels)`; the gate stands at `ada.from`.
+    pub fn add_gated(x: &mut [f32], h: &[f32], ada: Columns, channels: usize) {
+        let rows = x.chunks_exact_mut(channels).zip(h.chunks_exact(channels));
+        for ((x, h), ada_row) in rows.zip(ada.values.chunks_exact(ada.width)) {
+            let gate = &ada_row[ada.from..ada.from + channels];
+            x.iter_mut().zip(h.iter().zip(gate)).for_each(|(x, (h, gate))| *x = gate.mul_add(*h, *x));
+        }
+    }
+}
+
+per_isa! {
+    /// Gradients of [`modulate`]: `dx` holds that of the result and becomes that of `x`; `d_ada`, zeros, takes those of shift and scale.
+    pub fn modulate_back(x: &[f32], dx: &mut [f32], ada: Columns, d_ada: &mut [f32], channels: usize) {
+        let rows = x.chunks_exact(channels).zip(dx.chunks_exact_mut(channels));
+        let ada_rows = ada.values.chunks_exact(ada.width).zip(d_ada.chunks_exact_mut(ada.width));
+        for ((x, dx), (ada_row, d_row)) in rows.zip(ada_rows) {
+            let scale = &ada_row[ada.from + channels..ada.from + 2 * channels];
+            let (d_shift, d_scale) = d_row[ada.from..ada.from + 2 * channels].split_at_mut(channels);
+            d_shift.copy_from_slice(dx);
+            let columns = x.iter().zip(dx.iter_mut()).zip(scale.iter().zip(d_scale));
+            for ((x, dx), (scale, d_scale)) in columns {
+                *d_scale = x * *dx;
+                *dx *= scale + 1.0;
+            }
+        }
+    }
+}
+
+per_isa! {
+    /// Gradients of [`add_gated`]: `dh` holds that of the result and becomes that of `h`; `d_ada`, zeros, takes that of the gate.
+    pub fn add_gated_back(h: &[f32], dh: &mut [f32], ada: Columns, d_ada: &mut [f32], channels: usize) {
+        let rows = h.chunks_exact(channels).zip(dh.chunks_exact_mut(channels));
+        let ada_rows = ada.values.chunks_exact(ada.width).zip(d_ada.chunks_exact_mut(ada.width));
+        for ((h, dh), (ada_row, d_row)) in rows.zip(ada_rows) {
+            let (gate, d_gate) = (&ada_row[ada.from..ada.from + channels], &mut d_row[ada.from..ada.from + channels]);
+            let columns = h.iter().zip(dh.iter_mut()).zip(gate.iter().zip(d_gate));
+            for ((h, dh), (gate, d_gate)) in columns {
+                *d_gate = h * *dh;
+                *dh *= gate;
+            }
+        }
+    }
+}
+
+/// The first `columns` numbers of every row of `x` (`x_stride` apart) to the rows of `out` (with their own stride).
+pub fn copy_columns(x: &[f32], x_stride: usize, (out, out_stride): (&mut [f32], usize), columns: usize) {
+    for (x, out) in x.chunks(x_stride.max(1)).zip(out.chunks_mut(out_stride.max(1))) {
+        out[..columns].copy_from_slice(&x[..columns]);
+    }
+}
+
+/// Rows of `widths[0] + widths[1]` numbers, parted.
 pub fn split(joined: &[f32], widths: [usize; 2]) -> [Vec<f32>; 2] {
     let rows = joined.len() / (widths[0] + widths[1]);
     let (mut a, mut b) = (Vec::with_capacity(rows * widths[0]), Vec::with_capacity(rows * widths[1]));

@@ -3,7 +3,7 @@
 //! One kernel for two layers: group norm with Mish takes its statistics over (channels in the group x time) of an item, layer norm
 //! is the case of one step and one group.
 
-use super::{math, per_isa};
+use super::{math, per_isa, pool::Pooled};
 
 /// Which values share a mean and a variance, and what follows.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,18 +32,18 @@ pub struct NormGrads {
 
 /// Scratch by channel: the group's mean and inverse standard deviation spread over its channels, two sums, and their group means.
 struct Scratch {
-    mean: Vec<f32>,
-    rstd: Vec<f32>,
-    first: Vec<f32>,
-    second: Vec<f32>,
-    even: Vec<f32>,
-    odd: Vec<f32>,
+    mean: Pooled,
+    rstd: Pooled,
+    first: Pooled,
+    second: Pooled,
+    even: Pooled,
+    odd: Pooled,
 }
 
 impl Scratch {
     fn new(channels: usize) -> Self {
-        let zeros = || vec![0.0; channels];
-        Self { mean: zeros(), rstd: zeros(), first: zeros(), second: zeros(), even: zeros(), odd: zeros() }
+        let take = || Pooled::take(channels);
+        Self { mean: take(), rstd: take(), first: take(), second: take(), even: take(), odd: take() }
     }
 }
 
@@ -86,7 +86,7 @@ fn statistics(norm: Norm, x: &[f32], scratch: &mut Scratch) {
     fold_groups(norm, |c| first[c], mean, |mean| mean);
     first.fill(0.0);
     for row in x.chunks_exact(norm.channels) {
-        for ((sum, x), mean) in first.iter_mut().zip(row).zip(&*mean) {
+        for ((sum, x), mean) in first.iter_mut().zip(row).zip(mean.iter()) {
             let deviation = x - mean;
             *sum = deviation.mul_add(deviation, *sum);
         }
@@ -94,25 +94,23 @@ fn statistics(norm: Norm, x: &[f32], scratch: &mut Scratch) {
     fold_groups(norm, |c| first[c], rstd, |variance| 1.0 / (variance + norm.eps).sqrt());
 }
 
-/// Applies `f(z)` to the normalised, scaled and shifted values of an item.
+/// Applies `f(z)` to the normalised, scaled and shifted values of an item, in place.
 #[inline(always)]
-fn apply(item: (&[f32], &mut [f32]), scratch: &Scratch, weight: &[f32], bias: &[f32], f: impl Fn(f32) -> f32) {
-    let channels = weight.len();
-    for (x, out) in item.0.chunks_exact(channels).zip(item.1.chunks_exact_mut(channels)) {
-        let columns = scratch.mean.iter().zip(&scratch.rstd).zip(weight.iter().zip(bias));
-        for ((out, x), ((mean, rstd), (weight, bias))) in out.iter_mut().zip(x).zip(columns) {
-            *out = f(((x - mean) * rstd).mul_add(*weight, *bias));
+fn apply(item: &mut [f32], scratch: &Scratch, weight: &[f32], bias: &[f32], f: impl Fn(f32) -> f32) {
+    for x in item.chunks_exact_mut(weight.len()) {
+        let columns = scratch.mean.iter().zip(scratch.rstd.iter()).zip(weight.iter().zip(bias));
+        for (x, ((mean, rstd), (weight, bias))) in x.iter_mut().zip(columns) {
+            *x = f(((*x - mean) * rstd).mul_add(*weight, *bias));
         }
     }
 }
 
 per_isa! {
-    /// Normalises items of `(steps, channels)` in `x` into `out`; `weight` and `bias` are by channel.
-    pub fn forward(norm: Norm, x: &[f32], weight: &[f32], bias: &[f32], out: &mut [f32]) {
+    /// Normalises items of `(steps, channels)`; `weight` and `bias` are by channel.
+    pub fn in_place(norm: Norm, x: &mut [f32], weight: &[f32], bias: &[f32]) {
         let mut scratch = Scratch::new(norm.channels);
-        let size = norm.steps * norm.channels;
-        for item in x.chunks_exact(size).zip(out.chunks_exact_mut(size)) {
-            statistics(norm, item.0, &mut scratch);
+        for item in x.chunks_exact_mut(norm.steps * norm.channels) {
+            statistics(norm, item, &mut scratch);
             if norm.mish {
                 apply(item, &scratch, weight, bias, math::mish);
             } else {
@@ -127,7 +125,7 @@ per_isa! {
 fn through_mish(x: &[f32], dz: &mut [f32], scratch: &Scratch, weight: &[f32], bias: &[f32]) {
     let channels = weight.len();
     for (x, dz) in x.chunks_exact(channels).zip(dz.chunks_exact_mut(channels)) {
-        let columns = scratch.mean.iter().zip(&scratch.rstd).zip(weight.iter().zip(bias));
+        let columns = scratch.mean.iter().zip(scratch.rstd.iter()).zip(weight.iter().zip(bias));
         for ((dz, x), ((mean, rstd), (weight, bias))) in dz.iter_mut().zip(x).zip(columns) {
             *dz *= math::mish_derivative(((x - mean) * rstd).mul_add(*weight, *bias));
         }
@@ -144,7 +142,7 @@ fn through_statistics(norm: Norm, x: &[f32], dz: &mut [f32], weight: &[f32], scr
     second.fill(0.0);
     for (x, dz) in x.chunks_exact(channels).zip(dz.chunks_exact(channels)) {
         let sums = first.iter_mut().zip(second.iter_mut());
-        for (((first, second), (mean, rstd)), (x, dz)) in sums.zip(mean.iter().zip(&*rstd)).zip(x.iter().zip(dz)) {
+        for (((first, second), (mean, rstd)), (x, dz)) in sums.zip(mean.iter().zip(rstd.iter())).zip(x.iter().zip(dz)) {
             *first += dz;
             *second = dz.mul_add((x - mean) * rstd, *second);
         }
@@ -152,7 +150,7 @@ fn through_statistics(norm: Norm, x: &[f32], dz: &mut [f32], weight: &[f32], scr
     fold_groups(norm, |c| first[c] * weight[c], even, |mean| mean);
     fold_groups(norm, |c| second[c] * weight[c], odd, |mean| mean);
     for (x, dz) in x.chunks_exact(channels).zip(dz.chunks_exact_mut(channels)) {
-        let columns = mean.iter().zip(&*rstd).zip(weight.iter().zip(even.iter().zip(&*odd)));
+        let columns = mean.iter().zip(rstd.iter()).zip(weight.iter().zip(even.iter().zip(odd.iter())));
         for ((dz, x), ((mean, rstd), (weight, (even, odd)))) in dz.iter_mut().zip(x).zip(columns) {
             let normalised = (x - mean) * rstd;
             *dz = rstd * (-normalised).mul_add(*odd, dz.mul_add(*weight, -even));
@@ -161,7 +159,7 @@ fn through_statistics(norm: Norm, x: &[f32], dz: &mut [f32], weight: &[f32], scr
 }
 
 per_isa! {
-    /// Gradients from `dy`, the gradient to [`forward`]'s result; `affine` is (weight, bias).
+    /// Gradients from `dy`, the gradient to [`in_place`]'s result; `affine` is (weight, bias).
     pub fn backward(norm: Norm, x: &[f32], affine: (&[f32], &[f32]), dy: &[f32]) -> NormGrads {
         let mut grads = NormGrads { x: dy.to_vec(), weight: vec![0.0; norm.channels], bias: vec![0.0; norm.channels] };
         let mut scratch = Scratch::new(norm.channels);
@@ -172,8 +170,8 @@ per_isa! {
                 through_mish(x, dz, &scratch, affine.0, affine.1);
             }
             through_statistics(norm, x, dz, affine.0, &mut scratch);
-            grads.bias.iter_mut().zip(&scratch.first).for_each(|(total, sum)| *total += sum);
-            grads.weight.iter_mut().zip(&scratch.second).for_each(|(total, sum)| *total += sum);
+            grads.bias.iter_mut().zip(scratch.first.iter()).for_each(|(total, sum)| *total += sum);
+            grads.weight.iter_mut().zip(scratch.second.iter()).for_each(|(total, sum)| *total += sum);
         }
         grads
     }

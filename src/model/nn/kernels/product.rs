@@ -1,22 +1,77 @@
 //! The packed matrix product that does nearly everything: `out[i][j] (+)= sum_k A(i, k) B(k, j)`.
 //!
-//! `A` is addressed by two tables, `a[row_offset[i] + k_offset[k]]`, so that a convolution over a padded, channels-last buffer is
-//! a product whose rows overlap (no im2col), and its weight gradient the same product with the tables exchanged. `B` is packed in
-//! panels of up to 64 columns. A tile of 6 rows by one panel stays in registers over the whole of `k`, so each element is one chain
-//! of fused multiply-adds over ascending `k`, whatever the tile and the instruction set.
+//! A row of `A` begins anywhere in a slice and its terms follow each other there (or lie where a table says), so that a convolution
+//! over a padded, channels-last buffer is a product whose rows overlap (no im2col), and its weight gradient the same product with the
+//! tables exchanged. `B` is packed in panels of up to 64 columns. A tile of 6 rows by one panel stays in registers over the whole of
+//! `k`, so each element is one chain of fused multiply-adds over ascending `k`, whatever the tile and the instruction set.
+//!
+//! A row may say that only a range of its terms counts, because the others are zeros (the padding of a convolution). A tile then skips
+//! what none of its rows needs. Which terms are skipped depends on the rows around, the result does not: a term of zero changes a
+//! chain in nothing but the sign of a zero, and the last step of every chain adds +0.
 
-use super::{Isa, isa};
+use super::{Isa, isa, pool::Pooled};
+use std::ops::Range;
 
-/// Sixteen columns of one `k`, on their own cache line.
-#[derive(Clone, Copy, Debug, Default)]
-#[repr(C, align(64))]
-struct Lane([f32; LANE]);
-
-const LANE: usize = 16;
+/// Columns of one lane.
+pub(super) const LANE: usize = 16;
 /// Lanes of a full panel.
 const PANEL: usize = 4;
 /// Rows of a full tile.
 const TILE: usize = 6;
+
+/// How weights are held; arithmetic is in f32 in either case.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Precision {
+    /// As trained.
+    #[default]
+    F32,
+    /// Rounded to bfloat16 (nearest, ties to even): half the memory, for weights that do not fit the cache.
+    Bf16,
+}
+
+/// Sixteen columns of one `k`, on their own cache line.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(C, align(64))]
+pub(super) struct Lane([f32; LANE]);
+
+/// The numbers of lanes, one after the other.
+pub(super) fn flat(lanes: &[Lane]) -> &[f32] {
+    // SAFETY: a lane is 16 f32 without a gap, and its alignment is a multiple of theirs.
+    unsafe { std::slice::from_raw_parts(lanes.as_ptr().cast(), lanes.len() * LANE) }
+}
+
+/// See [`flat`].
+pub(super) fn flat_mut(lanes: &mut [Lane]) -> &mut [f32] {
+    // SAFETY: as above, and the borrow is unique.
+    unsafe { std::slice::from_raw_parts_mut(lanes.as_mut_ptr().cast(), lanes.len() * LANE) }
+}
+
+/// The same as bfloat16: the upper halves of the f32 bits.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(C, align(32))]
+struct HalfLane([u16; LANE]);
+
+/// A lane in memory, and as numbers.
+trait Stored: Copy {
+    fn get(&self, column: usize) -> f32;
+    /// # Safety
+    /// AVX-512 F at hand; `lane` points at a lane.
+    #[cfg(target_arch = "x86_64")]
+    unsafe fn load512(lane: *const Self) -> std::arch::x86_64::__m512;
+    /// # Safety
+    /// AVX2 at hand; `lane` points at a lane.
+    #[cfg(target_arch = "x86_64")]
+    unsafe fn load256(lane: *const Self) -> [std::arch::x86_64::__m256; 2];
+}
+
+#[derive(Clone, Debug)]
+enum Lanes {
+    F32(Vec<Lane>),
+    Bf16(Vec<HalfLane>),
+    /// For one use: memory of the pool.
+    Scratch(Pooled),
+}
 
 /// The right-hand side of a product, `(k, n)`, in panels of 64 columns; the last panel is as many lanes of 16 wide as it needs,
 /// its missing columns zero.
@@ -24,51 +79,84 @@ const TILE: usize = 6;
 pub struct Packed {
     k: usize,
     n: usize,
-    lanes: Vec<Lane>,
+    lanes: Lanes,
 }
 
 impl Packed {
-    /// Packs `B(k, j) = values[k_offset[k] + j * column_stride]` with `n` columns.
-    pub fn new(values: &[f32], k_offset: &[usize], n: usize, column_stride: usize) -> Self {
-        let k = k_offset.len();
-        let mut lanes = vec![Lane::default(); k * n.div_ceil(LANE)];
-        for (panel, start) in (0..n).step_by(PANEL * LANE).enumerate() {
-            let width = panel_width(n, panel);
-            let panel = &mut lanes[panel * PANEL * k..][..width * k];
-            let (end, values) = (n.min(start + PANEL * LANE), &values[start * column_stride..]);
-            if column_stride == 1 {
-                copy_rows(panel, values, k_offset, end - start);
-            } else {
-                copy_columns(panel, values, k_offset, (end - start, column_stride));
-            }
-        }
-        Self { k, n, lanes }
+    /// Packs `k` terms of `columns` columns: `B(k, j) = values[terms.at(k) + j * column_stride]`.
+    pub fn new<T: Terms>(values: &[f32], (terms, k): (T, usize), (columns, column_stride): (usize, usize)) -> Self {
+        let mut lanes = vec![Lane::default(); k * columns.div_ceil(LANE)];
+        pack(values, (terms, k), (columns, column_stride), &mut lanes);
+        Self { k, n: columns, lanes: Lanes::F32(lanes) }
+    }
+
+    /// The same for one use, in memory of the pool.
+    pub fn scratch<T: Terms>(values: &[f32], (terms, k): (T, usize), (columns, column_stride): (usize, usize)) -> Self {
+        let mut lanes = Pooled::zeros(k * columns.div_ceil(LANE) * LANE);
+        pack(values, (terms, k), (columns, column_stride), lanes.lanes_mut());
+        Self { k, n: columns, lanes: Lanes::Scratch(lanes) }
+    }
+
+    /// The same weights, held with this precision; what was rounded once stays so.
+    #[must_use]
+    pub fn held_as(self, precision: Precision) -> Self {
+        let lanes = match (precision, self.lanes) {
+            (Precision::Bf16, Lanes::F32(lanes)) => Lanes::Bf16(lanes.iter().map(|lane| HalfLane(lane.0.map(bf16_bits))).collect()),
+            (_, lanes) => lanes,
+        };
+        Self { lanes, ..self }
     }
 
     /// Columns.
     pub fn columns(&self) -> usize {
         self.n
     }
-}
 
-/// Fills a panel from rows that are contiguous.
-fn copy_rows(panel: &mut [Lane], values: &[f32], k_offset: &[usize], columns: usize) {
-    for (lanes, &offset) in panel.chunks_exact_mut(columns.div_ceil(LANE)).zip(k_offset) {
-        let row = values[offset..offset + columns].chunks(LANE);
-        lanes.iter_mut().zip(row).for_each(|(lane, row)| lane.0[..row.len()].copy_from_slice(row));
+    /// Terms of a chain.
+    pub fn terms(&self) -> usize {
+        self.k
+    }
+
+    /// Bytes of the weights.
+    pub fn bytes(&self) -> usize {
+        match &self.lanes {
+            Lanes::F32(lanes) => size_of_val(lanes.as_slice()),
+            Lanes::Bf16(lanes) => size_of_val(lanes.as_slice()),
+            Lanes::Scratch(lanes) => size_of_val(lanes.lanes()),
+        }
     }
 }
 
-/// Fills a panel from columns `stride` apart, by blocks of `k` that stay in the first cache. Columns nearer to each other than that
-/// are interleaved, so a block of one stride reads in the order of memory.
-fn copy_columns(panel: &mut [Lane], values: &[f32], k_offset: &[usize], (columns, stride): (usize, usize)) {
-    let (width, block) = (columns.div_ceil(LANE), stride.clamp(1, 64));
-    for (panel, k_offset) in panel.chunks_mut(block * width).zip(k_offset.chunks(block)) {
-        for column in 0..columns {
-            let values = &values[column * stride..];
-            for (row, &offset) in k_offset.iter().enumerate() {
-                panel[row * width + column / LANE].0[column % LANE] = values[offset];
-            }
+/// The bfloat16 nearest to a finite f32, ties to even.
+fn bf16_bits(value: f32) -> u16 {
+    let bits = value.to_bits();
+    (bits.wrapping_add(0x7fff + (bits >> 16 & 1)) >> 16) as u16
+}
+
+/// Fills lanes of zeros, panel by panel.
+fn pack<T: Terms>(values: &[f32], (terms, k): (T, usize), (columns, stride): (usize, usize), lanes: &mut [Lane]) {
+    for (panel, start) in (0..columns).step_by(PANEL * LANE).enumerate() {
+        let panel = &mut lanes[panel * PANEL * k..][..panel_width(columns, panel) * k];
+        let (count, values) = (columns.min(start + PANEL * LANE) - start, &values[start * stride..]);
+        if stride == 1 { copy_rows(panel, values, terms, count) } else { copy_columns(panel, values, terms, (count, stride)) }
+    }
+}
+
+/// Fills a panel from rows that are contiguous.
+fn copy_rows<T: Terms>(panel: &mut [Lane], values: &[f32], terms: T, columns: usize) {
+    for (k, lanes) in panel.chunks_exact_mut(columns.div_ceil(LANE)).enumerate() {
+        flat_mut(lanes)[..columns].copy_from_slice(&values[terms.at(k)..][..columns]);
+    }
+}
+
+/// Fills a panel from columns `stride` apart: 16 columns are read side by side, so that each line is written once.
+fn copy_columns<T: Terms>(panel: &mut [Lane], values: &[f32], terms: T, (columns, stride): (usize, usize)) {
+    let width = columns.div_ceil(LANE);
+    for start in (0..columns).step_by(LANE) {
+        let (count, values) = (LANE.min(columns - start), &values[start * stride..]);
+        for (k, lane) in panel[start / LANE..].iter_mut().step_by(width).enumerate() {
+            let column = values[terms.at(k)..].iter().step_by(stride);
+            lane.0[..count].iter_mut().zip(column).for_each(|(to, from)| *to = *from);
         }
     }
 }
@@ -78,15 +166,77 @@ fn panel_width(n: usize, panel: usize) -> usize {
     (n.div_ceil(LANE) - panel * PANEL).min(PANEL)
 }
 
-/// The left-hand side of a product: `A(i, k) = values[row_offset[i] + k_offset[k]]`.
+/// One row of a product: where it is read, where its result goes, and which of its terms are not known to be zero.
+#[derive(Clone, Debug, Default)]
+pub struct Row {
+    /// Begin of the row in the left-hand slice.
+    pub from: usize,
+    /// Begin of its result in the output.
+    pub to: usize,
+    /// Terms that count.
+    pub terms: Range<usize>,
+}
+
+/// Where the terms of a row lie, relative to its begin.
+pub trait Terms: Copy {
+    /// Offset of term `k`.
+    fn at(self, k: usize) -> usize;
+    /// The largest offset of `count` terms.
+    fn last(self, count: usize) -> usize;
+}
+
+/// One after the other.
 #[derive(Clone, Copy, Debug)]
-pub struct Rows<'a> {
-    /// What the tables point into.
+pub struct InLine;
+
+/// So far apart.
+#[derive(Clone, Copy, Debug)]
+pub struct Every(pub usize);
+
+/// At the offsets of a table.
+#[derive(Clone, Copy, Debug)]
+pub struct Table<'a>(pub &'a [usize]);
+
+impl Terms for InLine {
+    #[inline(always)]
+    fn at(self, k: usize) -> usize {
+        k
+    }
+
+    fn last(self, count: usize) -> usize {
+        count.saturating_sub(1)
+    }
+}
+
+impl Terms for Every {
+    #[inline(always)]
+    fn at(self, k: usize) -> usize {
+        k * self.0
+    }
+
+    fn last(self, count: usize) -> usize {
+        count.saturating_sub(1) * self.0
+    }
+}
+
+impl Terms for Table<'_> {
+    #[inline(always)]
+    fn at(self, k: usize) -> usize {
+        self.0[k]
+    }
+
+    fn last(self, count: usize) -> usize {
+        self.0[..count].iter().copied().max().unwrap_or(0)
+    }
+}
+
+/// The left-hand side of a product: `A(i, k) = values[rows[i].from + terms.at(k)]`.
+#[derive(Clone, Copy, Debug)]
+pub struct Left<'a, T> {
+    /// What the rows lie in.
     pub values: &'a [f32],
-    /// By row.
-    pub row_offset: &'a [usize],
-    /// By `k`.
-    pub k_offset: &'a [usize],
+    /// Where the terms of a row lie.
+    pub terms: T,
 }
 
 /// The first term of each element's chain.
@@ -100,35 +250,57 @@ pub enum Start<'a> {
     Out,
 }
 
-/// Multiplies: row `i` of the result goes to `out[i * out_stride..][..n]`.
+/// `count` whole rows of `k` terms, `from_stride` apart in the left-hand slice and `to_stride` apart in the output.
+pub fn even_rows(count: usize, from_stride: usize, to_stride: usize, k: usize) -> impl Iterator<Item = Row> + Clone {
+    (0..count).map(move |i| Row { from: i * from_stride, to: i * to_stride, terms: 0..k })
+}
+
+/// Multiplies: the result of each row goes to `out[row.to..][..n]`.
 ///
 /// # Panics
-/// If a table points outside its slice, or the sizes do not fit each other.
-pub fn product(a: Rows, b: &Packed, start: Start, out: &mut [f32], out_stride: usize) {
-    let (rows, k) = (a.row_offset.len(), a.k_offset.len());
-    assert_eq!(k, b.k, "the two sides of a product differ in k");
-    if rows == 0 || b.n == 0 {
-        return;
+/// If a row points outside its slice, or the sizes do not fit each other.
+pub fn product<T: Terms>(a: Left<T>, b: &Packed, start: Start, out: &mut [f32], rows: impl Iterator<Item = Row> + Clone) {
+    match &b.lanes {
+        Lanes::F32(lanes) => by_panels(a, (b, lanes), start, out, rows),
+        Lanes::Bf16(lanes) => by_panels(a, (b, lanes), start, out, rows),
+        Lanes::Scratch(lanes) => by_panels(a, (b, lanes.lanes()), start, out, rows),
     }
-    let largest = |table: &[usize]| table.iter().copied().max().unwrap_or(0);
-    assert!(k == 0 || largest(a.row_offset) + largest(a.k_offset) < a.values.len(), "a table points outside the left-hand side");
-    assert!(b.n <= out_stride && (rows - 1) * out_stride + b.n <= out.len(), "the output is too small");
+}
+
+fn by_panels<T: Terms, S: Stored>(
+    a: Left<T>,
+    (b, lanes): (&Packed, &[S]),
+    start: Start,
+    out: &mut [f32],
+    rows: impl Iterator<Item = Row> + Clone,
+) {
+    let last = a.terms.last(b.k);
     if let Start::Bias(bias) = start {
         assert_eq!(bias.len(), b.n, "one bias a column");
     }
+    let isa = isa();
     for (panel, column) in (0..b.n).step_by(PANEL * LANE).enumerate() {
         let width = panel_width(b.n, panel);
-        let lanes = &b.lanes[panel * PANEL * k..][..width * k];
+        let lanes = &lanes[panel * PANEL * b.k..][..width * b.k];
         let columns = (b.n - column).min(PANEL * LANE);
         let start = match start {
             Start::Bias(bias) => Start::Bias(&bias[column..column + columns]),
             other => other,
         };
-        for (tile, row_offset) in a.row_offset.chunks(TILE).enumerate() {
-            let out = &mut out[tile * TILE * out_stride + column..];
-            let tile = Tile { a: Rows { row_offset, ..a }, lanes, columns, start, out_stride };
-            match isa() {
-                // SAFETY: the processor has the set; the assertions above hold for every tile.
+        let mut rows = rows.clone();
+        loop {
+            let mut tile = Tile { a, lanes, columns, start, from: [0; TILE], to: [0; TILE], rows: 0, terms: b.k..0 };
+            for row in rows.by_ref().take(TILE) {
+                assert!(row.terms.end <= b.k && (b.k == 0 || row.from + last < a.values.len()), "a row reaches outside the left-hand side");
+                assert!(row.to + b.n <= out.len(), "the output is too small");
+                tile.admit(&row, column);
+            }
+            if tile.rows == 0 {
+                break;
+            }
+            tile.terms.start = tile.terms.start.min(tile.terms.end);
+            match isa {
+                // SAFETY: the processor has the set; the assertions above hold for every row of the tile.
                 #[cfg(target_arch = "x86_64")]
                 Isa::Avx512 => unsafe { x86::avx512(&tile, out) },
                 // SAFETY: as above.
@@ -140,16 +312,28 @@ pub fn product(a: Rows, b: &Packed, start: Start, out: &mut [f32], out_stride: u
     }
 }
 
-/// A few rows of the product with one panel; `out` begins at the tile's corner.
-struct Tile<'a> {
-    a: Rows<'a>,
-    lanes: &'a [Lane],
+/// A few rows of the product with one panel.
+struct Tile<'a, T, S> {
+    a: Left<'a, T>,
+    lanes: &'a [S],
     columns: usize,
     start: Start<'a>,
-    out_stride: usize,
+    from: [usize; TILE],
+    /// Begin of each row's result in this panel.
+    to: [usize; TILE],
+    rows: usize,
+    /// What at least one row needs.
+    terms: Range<usize>,
 }
 
-impl Tile<'_> {
+impl<T: Terms, S: Stored> Tile<'_, T, S> {
+    #[inline(always)]
+    fn admit(&mut self, row: &Row, column: usize) {
+        (self.from[self.rows], self.to[self.rows]) = (row.from, row.to + column);
+        self.rows += 1;
+        self.terms = self.terms.start.min(row.terms.start)..self.terms.end.max(row.terms.end);
+    }
+
     fn width(&self) -> usize {
         self.columns.div_ceil(LANE)
     }
@@ -161,67 +345,114 @@ impl Tile<'_> {
         match self.start {
             Start::Zero => {}
             Start::Bias(bias) => terms[..columns.len()].copy_from_slice(&bias[columns]),
-            Start::Out => terms[..columns.len()].copy_from_slice(&out[row * self.out_stride..][columns]),
+            Start::Out => terms[..columns.len()].copy_from_slice(&out[self.to[row]..][columns]),
         }
         terms
     }
 
     fn store(&self, row: usize, lane: usize, values: &[f32; LANE], out: &mut [f32]) {
         let columns = lane * LANE..self.columns.min((lane + 1) * LANE);
-        let count = columns.len();
-        out[row * self.out_stride..][columns].copy_from_slice(&values[..count]);
+        out[self.to[row]..][columns].iter_mut().zip(values).for_each(|(out, value)| *out = value + 0.0);
     }
 }
 
 /// The twin without intrinsics: the same chains.
-fn portable(tile: &Tile, out: &mut [f32]) {
+fn portable<T: Terms, S: Stored>(tile: &Tile<T, S>, out: &mut [f32]) {
     let width = tile.width();
-    for (row, &row_offset) in tile.a.row_offset.iter().enumerate() {
+    for row in 0..tile.rows {
         for lane in 0..width {
             let mut sums = tile.first_terms(row, lane, out);
-            for (k, &k_offset) in tile.a.k_offset.iter().enumerate() {
-                let a = tile.a.values[row_offset + k_offset];
-                let b = &tile.lanes[k * width + lane].0;
-                sums.iter_mut().zip(b).for_each(|(sum, &b)| *sum = a.mul_add(b, *sum));
+            for k in tile.terms.clone() {
+                let a = tile.a.values[tile.from[row] + tile.a.terms.at(k)];
+                let b = &tile.lanes[k * width + lane];
+                sums.iter_mut().enumerate().for_each(|(column, sum)| *sum = a.mul_add(b.get(column), *sum));
             }
             tile.store(row, lane, &sums, out);
         }
     }
 }
 
+impl Stored for Lane {
+    #[inline(always)]
+    fn get(&self, column: usize) -> f32 {
+        self.0[column]
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[inline(always)]
+    unsafe fn load512(lane: *const Self) -> std::arch::x86_64::__m512 {
+        // SAFETY: a lane is 64 aligned bytes.
+        unsafe { std::arch::x86_64::_mm512_load_ps(lane.cast()) }
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[inline(always)]
+    unsafe fn load256(lane: *const Self) -> [std::arch::x86_64::__m256; 2] {
+        let low = lane.cast::<f32>();
+        // SAFETY: as above.
+        unsafe { [std::arch::x86_64::_mm256_load_ps(low), std::arch::x86_64::_mm256_load_ps(low.add(8))] }
+    }
+}
+
+impl Stored for HalfLane {
+    #[inline(always)]
+    fn get(&self, column: usize) -> f32 {
+        f32::from_bits(u32::from(self.0[column]) << 16)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[inline(always)]
+    unsafe fn load512(lane: *const Self) -> std::arch::x86_64::__m512 {
+        use std::arch::x86_64::*;
+        // SAFETY: a half lane is 32 aligned bytes.
+        unsafe { _mm512_castsi512_ps(_mm512_slli_epi32::<16>(_mm512_cvtepu16_epi32(_mm256_load_si256(lane.cast())))) }
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[inline(always)]
+    unsafe fn load256(lane: *const Self) -> [std::arch::x86_64::__m256; 2] {
+        use std::arch::x86_64::*;
+        let low = lane.cast::<__m128i>();
+        // SAFETY: as above.
+        let halves = unsafe { [_mm_load_si128(low), _mm_load_si128(low.add(1))] };
+        // SAFETY: AVX2 is at hand, says the caller.
+        halves.map(|half| unsafe { _mm256_castsi256_ps(_mm256_slli_epi32::<16>(_mm256_cvtepu16_epi32(half))) })
+    }
+}
+
 #[cfg(target_arch = "x86_64")]
 #[allow(clippy::needless_range_loop, reason = "tiles are addressed by row and lane")]
 mod x86 {
-    use super::{LANE, Tile};
+    use super::{LANE, Start, Stored, Terms, Tile};
     use std::arch::x86_64::*;
 
     /// Calls `$tile::<rows, lanes>` for the sizes at hand.
     macro_rules! by_size {
         ($tile:ident, $rows:expr, $lanes:expr, $($argument:expr),*) => {
             match ($rows, $lanes) {
-                (1, 1) => $tile::<1, 1>($($argument),*), (1, 2) => $tile::<1, 2>($($argument),*),
-                (1, 3) => $tile::<1, 3>($($argument),*), (1, 4) => $tile::<1, 4>($($argument),*),
-                (2, 1) => $tile::<2, 1>($($argument),*), (2, 2) => $tile::<2, 2>($($argument),*),
-                (2, 3) => $tile::<2, 3>($($argument),*), (2, 4) => $tile::<2, 4>($($argument),*),
-                (3, 1) => $tile::<3, 1>($($argument),*), (3, 2) => $tile::<3, 2>($($argument),*),
-                (3, 3) => $tile::<3, 3>($($argument),*), (3, 4) => $tile::<3, 4>($($argument),*),
-                (4, 1) => $tile::<4, 1>($($argument),*), (4, 2) => $tile::<4, 2>($($argument),*),
-                (4, 3) => $tile::<4, 3>($($argument),*), (4, 4) => $tile::<4, 4>($($argument),*),
-                (5, 1) => $tile::<5, 1>($($argument),*), (5, 2) => $tile::<5, 2>($($argument),*),
-                (5, 3) => $tile::<5, 3>($($argument),*), (5, 4) => $tile::<5, 4>($($argument),*),
-                (6, 1) => $tile::<6, 1>($($argument),*), (6, 2) => $tile::<6, 2>($($argument),*),
-                (6, 3) => $tile::<6, 3>($($argument),*), (6, 4) => $tile::<6, 4>($($argument),*),
+                (1, 1) => $tile::<1, 1, _, _>($($argument),*), (1, 2) => $tile::<1, 2, _, _>($($argument),*),
+                (1, 3) => $tile::<1, 3, _, _>($($argument),*), (1, 4) => $tile::<1, 4, _, _>($($argument),*),
+                (2, 1) => $tile::<2, 1, _, _>($($argument),*), (2, 2) => $tile::<2, 2, _, _>($($argument),*),
+                (2, 3) => $tile::<2, 3, _, _>($($argument),*), (2, 4) => $tile::<2, 4, _, _>($($argument),*),
+                (3, 1) => $tile::<3, 1, _, _>($($argument),*), (3, 2) => $tile::<3, 2, _, _>($($argument),*),
+                (3, 3) => $tile::<3, 3, _, _>($($argument),*), (3, 4) => $tile::<3, 4, _, _>($($argument),*),
+                (4, 1) => $tile::<4, 1, _, _>($($argument),*), (4, 2) => $tile::<4, 2, _, _>($($argument),*),
+                (4, 3) => $tile::<4, 3, _, _>($($argument),*), (4, 4) => $tile::<4, 4, _, _>($($argument),*),
+                (5, 1) => $tile::<5, 1, _, _>($($argument),*), (5, 2) => $tile::<5, 2, _, _>($($argument),*),
+                (5, 3) => $tile::<5, 3, _, _>($($argument),*), (5, 4) => $tile::<5, 4, _, _>($($argument),*),
+                (6, 1) => $tile::<6, 1, _, _>($($argument),*), (6, 2) => $tile::<6, 2, _, _>($($argument),*),
+                (6, 3) => $tile::<6, 3, _, _>($($argument),*), (6, 4) => $tile::<6, 4, _, _>($($argument),*),
                 _ => unreachable!("a tile is 1 to 6 rows by 1 to 4 lanes"),
             }
         };
     }
 
     /// # Safety
-    /// AVX-512 F at hand, the tile's tables within its values, its lanes `width * k`, `out` large enough for its rows.
+    /// AVX-512 F at hand, the tile's rows within its values, its lanes `width * k`, `out` large enough for its results.
     #[target_feature(enable = "avx512f")]
-    pub(super) unsafe fn avx512(tile: &Tile, out: &mut [f32]) {
+    pub(super) unsafe fn avx512<T: Terms, S: Stored>(tile: &Tile<T, S>, out: &mut [f32]) {
         // SAFETY: the caller's promises are those of the callee.
-        unsafe { by_size!(avx512_tile, tile.a.row_offset.len(), tile.width(), tile, out) }
+        unsafe { by_size!(avx512_tile, tile.rows, tile.width(), tile, out) }
     }
 
     /// `R` rows by `V` lanes, all sums in registers.
@@ -229,31 +460,29 @@ mod x86 {
     /// # Safety
     /// That of [`avx512`], and the tile has `R` rows and `V` lanes.
     #[target_feature(enable = "avx512f")]
-    unsafe fn avx512_tile<const R: usize, const V: usize>(tile: &Tile, out: &mut [f32]) {
+    unsafe fn avx512_tile<const R: usize, const V: usize, T: Terms, S: Stored>(tile: &Tile<T, S>, out: &mut [f32]) {
         let mut sums = [[_mm512_setzero_ps(); V]; R];
         let last = tile.columns - (V - 1) * LANE;
         let mask = |v: usize| if v + 1 == V { (((1_u32 << last) - 1) & 0xffff) as __mmask16 } else { !0 };
-        let mut rows = [tile.a.values.as_ptr(); R];
-        // SAFETY: every row offset plus every k offset is an index of `values`; `lanes` holds `V` lanes of 64 aligned bytes for
-        // each k; the masks leave out columns beyond `columns`, so bias and output are touched only within their slices.
+        // SAFETY: every row plus the offset of every term is an index of `values`; `lanes` holds `V` lanes for each k; the masks
+        // leave out columns beyond `columns`, so bias and output are touched only within their slices.
         unsafe {
             for r in 0..R {
-                rows[r] = rows[r].add(*tile.a.row_offset.get_unchecked(r));
                 for v in 0..V {
                     sums[r][v] = match tile.start {
-                        super::Start::Zero => _mm512_setzero_ps(),
-                        super::Start::Bias(bias) => _mm512_maskz_loadu_ps(mask(v), bias.as_ptr().add(v * LANE)),
-                        super::Start::Out => _mm512_maskz_loadu_ps(mask(v), out.as_ptr().add(r * tile.out_stride + v * LANE)),
+                        Start::Zero => _mm512_setzero_ps(),
+                        Start::Bias(bias) => _mm512_maskz_loadu_ps(mask(v), bias.as_ptr().add(v * LANE)),
+                        Start::Out => _mm512_maskz_loadu_ps(mask(v), out.as_ptr().add(tile.to[r] + v * LANE)),
                     };
                 }
             }
-            let mut lane = tile.lanes.as_ptr().cast::<f32>();
-            for &offset in tile.a.k_offset {
-                let mut b = [_mm512_setzero_ps(); V];
-                for v in 0..V {
-                    b[v] = _mm512_load_ps(lane.add(v * LANE));
-                }
-                lane = lane.add(V * LANE);
+            let values = tile.a.values.as_ptr();
+            let rows: [*const f32; R] = std::array::from_fn(|r| values.add(tile.from[r]));
+            let mut lane = tile.lanes.as_ptr().add(tile.terms.start * V);
+            for k in tile.terms.clone() {
+                let offset = tile.a.terms.at(k);
+                let b: [__m512; V] = std::array::from_fn(|v| S::load512(lane.add(v)));
+                lane = lane.add(V);
                 for r in 0..R {
                     let a = _mm512_set1_ps(*rows[r].add(offset));
                     for v in 0..V {
@@ -261,9 +490,10 @@ mod x86 {
                     }
                 }
             }
+            let zero = _mm512_setzero_ps();
             for r in 0..R {
                 for v in 0..V {
-                    _mm512_mask_storeu_ps(out.as_mut_ptr().add(r * tile.out_stride + v * LANE), mask(v), sums[r][v]);
+                    _mm512_mask_storeu_ps(out.as_mut_ptr().add(tile.to[r] + v * LANE), mask(v), _mm512_add_ps(sums[r][v], zero));
                 }
             }
         }
@@ -272,10 +502,10 @@ mod x86 {
     /// # Safety
     /// AVX2 and FMA at hand, and the other promises of [`avx512`].
     #[target_feature(enable = "avx2,fma")]
-    pub(super) unsafe fn avx2(tile: &Tile, out: &mut [f32]) {
+    pub(super) unsafe fn avx2<T: Terms, S: Stored>(tile: &Tile<T, S>, out: &mut [f32]) {
         for lane in 0..tile.width() {
             // SAFETY: the caller's promises are those of the callee.
-            unsafe { by_size!(avx2_tile, tile.a.row_offset.len(), 1, tile, lane, out) }
+            unsafe { by_size!(avx2_tile, tile.rows, 1, tile, lane, out) }
         }
     }
 
@@ -284,22 +514,21 @@ mod x86 {
     /// # Safety
     /// That of [`avx2`], the tile has `R` rows, and `lane` is one of its lanes.
     #[target_feature(enable = "avx2,fma")]
-    unsafe fn avx2_tile<const R: usize, const V: usize>(tile: &Tile, lane: usize, out: &mut [f32]) {
+    unsafe fn avx2_tile<const R: usize, const V: usize, T: Terms, S: Stored>(tile: &Tile<T, S>, lane: usize, out: &mut [f32]) {
         let mut sums = [[_mm256_setzero_ps(); 2]; R];
-        let mut rows = [tile.a.values.as_ptr(); R];
-        // SAFETY: every row offset plus every k offset is an index of `values`; `lanes` holds `width` lanes of 64 aligned bytes for
-        // each k; the arrays loaded and stored are 16 long.
+        // SAFETY: every row plus the offset of every term is an index of `values`; `lanes` holds `width` lanes for each k; the arrays
+        // loaded and stored are 16 long.
         unsafe {
             for r in 0..R {
-                rows[r] = rows[r].add(*tile.a.row_offset.get_unchecked(r));
                 let terms = tile.first_terms(r, lane, out);
                 sums[r] = [_mm256_loadu_ps(terms.as_ptr()), _mm256_loadu_ps(terms.as_ptr().add(8))];
             }
-            let step = tile.width() * LANE;
-            let mut b = tile.lanes.as_ptr().cast::<f32>().add(lane * LANE);
-            for &offset in tile.a.k_offset {
-                let (low, high) = (_mm256_load_ps(b), _mm256_load_ps(b.add(8)));
-                b = b.wrapping_add(step);
+            let values = tile.a.values.as_ptr();
+            let rows: [*const f32; R] = std::array::from_fn(|r| values.add(tile.from[r]));
+            let width = tile.width();
+            for k in tile.terms.clone() {
+                let offset = tile.a.terms.at(k);
+                let [low, high] = S::load256(tile.lanes.as_ptr().add(k * width + lane));
                 for r in 0..R {
                     let a = _mm256_set1_ps(*rows[r].add(offset));
                     sums[r] = [_mm256_fmadd_ps(a, low, sums[r][0]), _mm256_fmadd_ps(a, high, sums[r][1])];
@@ -312,5 +541,21 @@ mod x86 {
                 tile.store(r, lane, &values, out);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A value that needs no rounding stays; between two neighbours the nearer one is taken, and the even one at a tie.
+    #[test]
+    fn bf16_rounds_to_nearest_even() {
+        let back = |value: f32| f32::from_bits(u32::from(bf16_bits(value)) << 16);
+        assert_eq!(back(-1.5), -1.5);
+        assert_eq!(back(0.0).to_bits(), 0);
+        assert_eq!(back(1.0 + 1.0 / 256.0), 1.0, "a tie goes to the even neighbour");
+        assert_eq!(back(1.0 + 3.0 / 256.0), 1.0 + 1.0 / 64.0, "and here up");
+        assert_eq!(back(1.0 + 1.1 / 256.0), 1.0 + 1.0 / 128.0);
     }
 }

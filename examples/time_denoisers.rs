@@ -1,0 +1,140 @@
+//! Times one denoiser in the words of `benches/peers/torch_denoisers.py`, so that a comparison can be made in one run:
+//!
+//!     cargo run --release --example time_denoisers -- --net unet --widths 32,64,64,64 --batch 32 --threads 2 --what forward
+//!
+//! Prints one JSON line with the median milliseconds. More threads share a batch as the workers of a server do, each taking whole rows.
+
+use ada_diffuser::model::{
+    Networks,
+    config::ModelConfig,
+    denoiser::{Condition, Denoiser, DenoiserConfig},
+    latent::LatentConfig,
+    nn::{Buffer, Params, Value},
+    noise::Philox,
+    trajectory::Layout,
+};
+use clap::{Parser, ValueEnum};
+use std::{sync::Barrier, time::Instant};
+
+/// Noisy window of HalfCheetah: 17 states and 6 actions, with 20 latents beside.
+const LAYOUT: Layout = Layout { state_dim: 17, action_dim: 6 };
+const LATENT: usize = 20;
+const LEVELS: usize = 150;
+
+/// Times one denoiser of HalfCheetah's sizes.
+#[derive(Parser)]
+struct Flags {
+    /// Which backbone.
+    #[arg(long, value_enum, default_value = "unet")]
+    net: Net,
+    /// Widths of the U-Net, by depth.
+    #[arg(long, value_delimiter = ',', default_value = "32,64,64,64")]
+    widths: Vec<usize>,
+    /// Width of the DiT; its heads are 32 wide.
+    #[arg(long, default_value_t = 256)]
+    width: usize,
+    /// Blocks of the DiT.
+    #[arg(long, default_value_t = 2)]
+    depth: usize,
+    /// Positions of a window.
+    #[arg(long, default_value_t = 16)]
+    len: usize,
+    /// Windows.
+    #[arg(long, default_value_t = 1)]
+    batch: usize,
+    /// Threads that share them.
+    #[arg(long, default_value_t = 1)]
+    threads: usize,
+    /// What is timed.
+    #[arg(long, value_enum, default_value = "forward")]
+    what: What,
+    /// For so long.
+    #[arg(long, default_value_t = 2.0)]
+    seconds: f64,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Net {
+    Unet,
+    Dit,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum What {
+    /// One evaluation of all windows.
+    Forward,
+}
+
+fn main() -> anyhow::Result<()> {
+    let flags = Flags::parse();
+    let config = config(&flags);
+    let ms = match flags.what {
+        What::Forward => forward(&flags, &config)?,
+    };
+    let net = if matches!(flags.net, Net::Unet) { "unet" } else { "dit" };
+    let widths = flags.widths.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
+    println!(
+        r#"{{"what":"forward","net":"{net}","widths":"{widths}","len":{},"batch":{},"threads":{},"ms":{ms:.4}}}"#,
+        flags.len, flags.batch, flags.threads
+    );
+    Ok(())
+}
+
+fn config(flags: &Flags) -> ModelConfig {
+    let denoiser = match flags.net {
+        Net::Unet => DenoiserConfig::Unet { widths: flags.widths.clone() },
+        Net::Dit => DenoiserConfig::Dit { width: flags.width, depth: flags.depth, heads: flags.width / 32 },
+    };
+    let plain = ModelConfig::plain(LAYOUT, Some(LatentConfig { dim: LATENT, hidden: 64 }), denoiser);
+    ModelConfig { plan_horizon: flags.len, level_max: LEVELS, ..plain }
+}
+
+/// The networks as a server has them: weights constant and packed once.
+fn frozen(config: &ModelConfig) -> anyhow::Result<Networks> {
+    let fresh = Params::fresh(0);
+    Networks::new(config, &fresh)?;
+    let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
+    Ok(Networks::new(config, &Params::loaded(tensors))?)
+}
+
+fn forward(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
+    let networks = frozen(config)?;
+    let shape = (flags.batch.div_ceil(flags.threads), flags.len);
+    let alone = median(rounds(&networks.denoiser, shape, &Barrier::new(1), 10)?);
+    let (count, meet) = ((flags.seconds * 1e3 / alone) as usize + 10, Barrier::new(flags.threads));
+    std::thread::scope(|scope| {
+        let (net, meet) = (&networks.denoiser, &meet);
+        let others: Vec<_> = (1..flags.threads).map(|_| scope.spawn(move || rounds(net, shape, meet, count))).collect();
+        let times = rounds(net, shape, meet, count);
+        for other in others {
+            other.join().map_err(|_| anyhow::anyhow!("a thread ended by panic"))??;
+        }
+        times.map(median)
+    })
+}
+
+/// Milliseconds of each round, from the moment all threads meet until each has evaluated its windows.
+fn rounds(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: usize) -> anyhow::Result<Vec<f64>> {
+    let (x, latents) = (normals([batch, len, LAYOUT.dim()])?, normals([batch, len, LATENT])?);
+    let levels: Vec<f32> = (0..batch * len).map(|i| (i * 7 % LEVELS) as f32).collect();
+    let round = |_| {
+        meet.wait();
+        let begin = Instant::now();
+        net.predict(&x, &Condition { levels: &levels, latents: Some(&latents), observed: None })?;
+        meet.wait();
+        Ok(begin.elapsed().as_secs_f64() * 1e3)
+    };
+    (0..count).map(round).collect()
+}
+
+fn normals(shape: [usize; 3]) -> anyhow::Result<Buffer> {
+    let mut stream = Philox::new(1);
+    Ok(Buffer::generate(shape, |out| out.iter_mut().for_each(|value| *value = stream.normal()))?)
+}
+
+fn median(mut times: Vec<f64>) -> f64 {
+    let warm = times.len() / 10;
+    let times = &mut times[warm..];
+    times.sort_by(f64::total_cmp);
+    times[times.len() / 2]
+}

@@ -1,0 +1,107 @@
+//! The denoiser on both kinds of values, and by row.
+
+use super::*;
+use crate::model::{
+    latent::LatentConfig,
+    nn::{Buffer, Precision},
+    noise::Philox,
+    trajectory::Layout,
+};
+use candle_core::Tensor;
+use proptest::prelude::*;
+
+const LAYOUT: Layout = Layout { state_dim: 3, action_dim: 2 };
+const LATENT: usize = 4;
+const LEN: usize = 8;
+const OBSERVED: usize = 10;
+
+fn config(denoiser: DenoiserConfig) -> ModelConfig {
+    ModelConfig { obs_horizon: 3, ..ModelConfig::plain(LAYOUT, Some(LatentConfig { dim: LATENT, hidden: 8 }), denoiser) }
+}
+
+fn backbones() -> [DenoiserConfig; 2] {
+    [DenoiserConfig::Unet { widths: vec![24, 40, 72] }, DenoiserConfig::Dit { width: 36, depth: 2, heads: 3 }]
+}
+
+/// The network, jogged so that no gate is closed and no norm plain, with weights packed once.
+fn denoiser(backbone: DenoiserConfig, precision: Precision) -> Denoiser {
+    let config = config(backbone);
+    let fresh = Params::fresh(1);
+    Denoiser::new(&config, &fresh).unwrap();
+    let jog = |(name, var): (String, candle_core::Var)| {
+        let mut stream = Philox::named(2, &name);
+        let noise: Vec<f32> = (0..var.elem_count()).map(|_| 0.1 * stream.normal()).collect();
+        (name, (var.as_tensor() + Tensor::from_vec(noise, var.shape(), var.device()).unwrap()).unwrap())
+    };
+    Denoiser::new(&config, &Params::loaded_as(fresh.vars().into_iter().map(jog).collect(), precision)).unwrap()
+}
+
+/// Inputs of one window, drawn.
+#[derive(Clone)]
+struct Window {
+    x: Vec<f32>,
+    latents: Vec<f32>,
+    levels: Vec<f32>,
+    observed: Vec<f32>,
+}
+
+fn window(seed: u64) -> Window {
+    let mut stream = Philox::new(seed);
+    let mut draw = |count: usize| (0..count).map(|_| stream.normal()).collect::<Vec<f32>>();
+    let (x, latents, observed) = (draw(LEN * 5), draw(LEN * LATENT), draw(OBSERVED));
+    Window { x, latents, observed, levels: (0..LEN).map(|_| stream.below(41) as f32).collect() }
+}
+
+fn predict<V: Value>(denoiser: &Denoiser, windows: &[Window]) -> V {
+    let join = |shape: [usize; 2], part: fn(&Window) -> &Vec<f32>| {
+        let rows: Vec<f32> = windows.iter().flat_map(|window| part(window).iter().copied()).collect();
+        V::generate([windows.len(), shape[0], shape[1]], |out| out.copy_from_slice(&rows)).unwrap()
+    };
+    let (x, latents) = (join([LEN, 5], |window| &window.x), join([LEN, LATENT], |window| &window.latents));
+    let observed = join([1, OBSERVED], |window| &window.observed);
+    let levels: Vec<f32> = windows.iter().flat_map(|window| window.levels.iter().copied()).collect();
+    denoiser.predict(&x, &Condition { levels: &levels, latents: Some(&latents), observed: Some(&observed) }).unwrap()
+}
+
+fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|value| value.to_bits()).collect()
+}
+
+/// Tensors with a way back and plain buffers are two ways through the same arithmetic.
+#[test]
+fn tensors_and_buffers_give_the_same_bits() {
+    for backbone in backbones() {
+        let denoiser = denoiser(backbone, Precision::F32);
+        let windows: Vec<Window> = (0..7).map(window).collect();
+        let tensors = predict::<Tensor>(&denoiser, &windows).flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert!(tensors.iter().any(|value| value.abs() > 0.1));
+        assert_eq!(bits(&tensors), bits(&predict::<Buffer>(&denoiser, &windows)));
+    }
+}
+
+/// Weights of half the bits move the estimate by about a bfloat16 rounding, 2^-9, not more and not less.
+#[test]
+fn bf16_weights_are_near() {
+    for backbone in backbones() {
+        let windows: Vec<Window> = (0..3).map(window).collect();
+        let full = predict::<Buffer>(&denoiser(backbone.clone(), Precision::F32), &windows);
+        let half = predict::<Buffer>(&denoiser(backbone, Precision::Bf16), &windows);
+        let norm = |values: &mut dyn Iterator<Item = f32>| values.map(|value| value * value).sum::<f32>().sqrt();
+        let share = norm(&mut full.iter().zip(half.iter()).map(|(a, b)| a - b)) / norm(&mut full.iter().copied());
+        assert!((1e-4..2e-2).contains(&share), "{share}");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    /// A row's bits are its own, whatever the batch, its place there, and how its weights are held.
+    #[test]
+    fn a_row_does_not_depend_on_its_batch(seeds in proptest::collection::vec(0_u64..1000, 1..40), unet: bool, half: bool) {
+        let denoiser = denoiser(backbones()[usize::from(!unet)].clone(), if half { Precision::Bf16 } else { Precision::F32 });
+        let windows: Vec<Window> = seeds.into_iter().map(window).collect();
+        let together = predict::<Buffer>(&denoiser, &windows);
+        for (window, row) in windows.iter().zip(together.chunks_exact(LEN * 5)) {
+            prop_assert_eq!(bits(&predict::<Buffer>(&denoiser, std::slice::from_ref(window))), bits(row));
+        }
+    }
+}
