@@ -13,6 +13,8 @@ use ada_diffuser::model::{
     noise::Philox,
     trajectory::Layout,
 };
+use ada_diffuser::train::{optimizer::Adam, parallel::side_by_side};
+use candle_core::{Tensor, backprop::GradStore};
 use clap::{Parser, ValueEnum};
 use std::{sync::Barrier, time::Instant};
 
@@ -63,6 +65,8 @@ enum Net {
 enum What {
     /// One evaluation of all windows.
     Forward,
+    /// One training step: mean square error, its gradient, Adam.
+    Train,
 }
 
 fn main() -> anyhow::Result<()> {
@@ -70,11 +74,13 @@ fn main() -> anyhow::Result<()> {
     let config = config(&flags);
     let ms = match flags.what {
         What::Forward => forward(&flags, &config)?,
+        What::Train => train(&flags, &config)?,
     };
+    let what = if matches!(flags.what, What::Forward) { "forward" } else { "train" };
     let net = if matches!(flags.net, Net::Unet) { "unet" } else { "dit" };
     let widths = flags.widths.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
     println!(
-        r#"{{"what":"forward","net":"{net}","widths":"{widths}","len":{},"batch":{},"threads":{},"ms":{ms:.4}}}"#,
+        r#"{{"what":"{what}","net":"{net}","widths":"{widths}","len":{},"batch":{},"threads":{},"ms":{ms:.4}}}"#,
         flags.len, flags.batch, flags.threads
     );
     Ok(())
@@ -115,7 +121,7 @@ fn forward(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
 
 /// Milliseconds of each round, from the moment all threads meet until each has evaluated its windows.
 fn rounds(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: usize) -> anyhow::Result<Vec<f64>> {
-    let (x, latents) = (normals([batch, len, LAYOUT.dim()])?, normals([batch, len, LATENT])?);
+    let (x, latents): (Buffer, Buffer) = (normals([batch, len, LAYOUT.dim()])?, normals([batch, len, LATENT])?);
     let levels: Vec<f32> = (0..batch * len).map(|i| (i * 7 % LEVELS) as f32).collect();
     let round = |_| {
         meet.wait();
@@ -127,9 +133,37 @@ fn rounds(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: u
     (0..count).map(round).collect()
 }
 
-fn normals(shape: [usize; 3]) -> anyhow::Result<Buffer> {
+fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
+    let params = Params::fresh(0);
+    let networks = Networks::new(config, &params)?;
+    let vars = params.vars();
+    let mut adam = Adam::new(&vars, |_| 0, 0.0, f64::INFINITY);
+    let shards: Vec<(Tensor, Tensor, Tensor)> = (0..flags.threads)
+        .map(|_| {
+            let shape = |width| [flags.batch / flags.threads, flags.len, width];
+            Ok((normals(shape(LAYOUT.dim()))?, normals(shape(LATENT))?, normals(shape(LAYOUT.dim()))?))
+        })
+        .collect::<anyhow::Result<_>>()?;
+    let gradient = |(x, latents, target): &(Tensor, Tensor, Tensor)| -> anyhow::Result<GradStore> {
+        let levels: Vec<f32> = (0..x.dim(0)? * flags.len).map(|i| (i * 7 % LEVELS) as f32).collect();
+        let y = networks.denoiser.predict(x, &Condition { levels: &levels, latents: Some(latents), observed: None })?;
+        Ok((y - target)?.sqr()?.mean_all()?.affine(1.0 / flags.threads as f64, 0.0)?.backward()?)
+    };
+    let gradient = &gradient;
+    let mut times = Vec::new();
+    let begin = Instant::now();
+    while begin.elapsed().as_secs_f64() < flags.seconds || times.len() < 10 {
+        let begin = Instant::now();
+        let grads = side_by_side(shards.iter().map(|shard| move || gradient(shard)).collect())?;
+        adam.step(&grads.into_iter().collect::<anyhow::Result<Vec<_>>>()?, &[3e-4])?;
+        times.push(begin.elapsed().as_secs_f64() * 1e3);
+    }
+    Ok(median(times))
+}
+
+fn normals<V: Value>(shape: [usize; 3]) -> anyhow::Result<V> {
     let mut stream = Philox::new(1);
-    Ok(Buffer::generate(shape, |out| out.iter_mut().for_each(|value| *value = stream.normal()))?)
+    Ok(V::generate(shape, |out| out.iter_mut().for_each(|value| *value = stream.normal()))?)
 }
 
 fn median(mut times: Vec<f64>) -> f64 {

@@ -2,6 +2,7 @@
 use ada_diffuser::train::{
     self, Options, Outcome,
     flags::{Cli, Inspect, Probe, Run},
+    parallel,
     recipe::Recipe,
     report,
 };
@@ -13,10 +14,16 @@ use std::process::{Command, ExitCode};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::{env, sync::Arc, thread, time::SystemTime};
 
-/// candle walks the graph of a loss recursively in backward; this is address space, not memory.
-const STACK_BYTES: usize = 256 << 20;
-/// One process, one core: at these sizes threads cost more than they give, and results must not depend on their number.
-const THREADS: [&str; 2] = ["RAYON_NUM_THREADS", "CANDLE_NUM_THREADS"];
+/// What the libraries read once, before main could set it safely, unless the caller has set it. Threads: the trainer has its own, one
+/// operation each. Memory: a step asks for the same large blocks as the one before; given back in between, each would be cleared by the
+/// system anew (a quarter of a step of the DiT).
+const ENVIRONMENT: [(&str, &str); 5] = [
+    ("RAYON_NUM_THREADS", "1"),
+    ("CANDLE_NUM_THREADS", "1"),
+    ("MALLOC_MMAP_THRESHOLD_", "1073741824"),
+    ("MALLOC_TRIM_THRESHOLD_", "4294967296"),
+    ("MALLOC_TOP_PAD_", "67108864"),
+];
 
 fn main() -> ExitCode {
     start(Cli::parse()).unwrap_or_else(|error| {
@@ -26,12 +33,12 @@ fn main() -> ExitCode {
 }
 
 fn start(cli: Cli) -> Result<ExitCode> {
-    if THREADS.iter().any(|name| env::var_os(name).is_none()) {
-        // Read once by the libraries, before main could set them safely: so this program starts itself anew.
-        let vars = THREADS.iter().filter(|name| env::var_os(name).is_none()).map(|name| (name, "1"));
+    let mut unset = ENVIRONMENT.iter().copied().filter(|(name, _)| env::var_os(name).is_none()).peekable();
+    if unset.peek().is_some() {
+        let vars: Vec<_> = unset.collect();
         return Err(Command::new(env::current_exe()?).args(env::args_os().skip(1)).envs(vars).exec()).context("cannot start itself anew");
     }
-    let worker = thread::Builder::new().stack_size(STACK_BYTES).spawn(|| match cli {
+    let worker = thread::Builder::new().stack_size(parallel::STACK_BYTES).spawn(|| match cli {
         Cli::Run(flags) => run(flags),
         Cli::Probe(flags) => probe(&flags),
         Cli::Inspect(flags) => inspect(&flags),

@@ -7,6 +7,7 @@ pub mod flags;
 pub mod learner;
 pub mod log;
 pub mod optimizer;
+pub mod parallel;
 pub mod probe;
 pub mod recipe;
 pub mod report;

@@ -2,6 +2,14 @@
 //!
 //! In place on plain slices: candle's own AdamW makes about ten temporaries for each parameter and has neither of the others.
 
+use super::parallel::side_by_side;
+use crate::model::nn::{
+    host::values,
+    kernels::{
+        join,
+        optimizer::{AdamStep, adam, square_sum, toward},
+    },
+};
 use anyhow::{Context, Result};
 use candle_core::{CpuStorage, InplaceOp1, Layout, Tensor, Var, backprop::GradStore};
 use serde::{Deserialize, Serialize};
@@ -51,16 +59,40 @@ impl LearningRate {
     }
 }
 
-/// A variable and its two moments.
+/// A variable, its two moments, and its gradient of this step.
 struct Slot {
+    name: String,
     var: Var,
     group: usize,
-    moments: RefCell<[Vec<f32>; 2]>,
+    moments: [Vec<f32>; 2],
+    grad: Vec<f32>,
+    /// Whether the loss reached it in this step.
+    reached: bool,
+}
+
+impl Slot {
+    /// Sums up the gradients to the variable, in order; the sum of their squares.
+    fn gather(&mut self, grads: &[GradStore]) -> Result<f64> {
+        self.reached = false;
+        for grad in grads.iter().filter_map(|grads| grads.get(self.var.as_tensor())) {
+            let grad = grad.contiguous()?;
+            let grad = values(&grad)?;
+            if self.reached {
+                join::add(&mut self.grad, &grad);
+            } else {
+                self.grad.clear();
+                self.grad.extend_from_slice(&grad);
+                self.reached = true;
+            }
+        }
+        Ok(if self.reached { square_sum(&self.grad) } else { 0.0 })
+    }
 }
 
 /// Adam over named variables in groups, each group with its own learning rate.
 pub struct Adam {
-    slots: BTreeMap<String, Slot>,
+    /// In the order of names.
+    slots: Vec<Slot>,
     steps: u64,
     weight_decay: f64,
     clip_norm: f64,
@@ -74,41 +106,38 @@ impl Adam {
     pub fn new(vars: &BTreeMap<String, Var>, group: impl Fn(&str) -> usize, weight_decay: f64, clip_norm: f64) -> Self {
         let slot = |(name, var): (&String, &Var)| {
             let zeros = || vec![0.0; var.elem_count()];
-            (name.clone(), Slot { var: var.clone(), group: group(name), moments: RefCell::new([zeros(), zeros()]) })
+            Slot { name: name.clone(), var: var.clone(), group: group(name), moments: [zeros(), zeros()], grad: zeros(), reached: false }
         };
         Self { slots: vars.iter().map(slot).collect(), steps: 0, weight_decay, clip_norm }
     }
 
-    /// One step; variables that the loss does not reach stay as they are. `rates` holds a learning rate for each group.
-    /// Returns the norm of the gradient before clipping; when that is not finite, nothing is changed.
+    /// One step on the sum of these gradients; variables that no loss reaches stay as they are. `rates` holds a learning rate for each
+    /// group. Returns the norm of the gradient before clipping; when that is not finite, nothing is changed.
     ///
     /// # Errors
     /// If a tensor operation fails.
-    pub fn step(&mut self, grads: &GradStore, rates: &[f64]) -> Result<f64> {
-        let mut reached: Vec<(&Slot, Vec<f32>)> = Vec::with_capacity(self.slots.len());
-        for slot in self.slots.values() {
-            if let Some(grad) = grads.get(slot.var.as_tensor()) {
-                reached.push((slot, grad.flatten_all()?.to_vec1()?));
-            }
-        }
-        let square = |grad: &Vec<f32>| grad.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>();
-        let norm = reached.iter().map(|(_, grad)| square(grad)).sum::<f64>().sqrt();
+    pub fn step(&mut self, grads: &[GradStore], rates: &[f64]) -> Result<f64> {
+        let squares = each_slot(&mut self.slots, |slot| slot.gather(grads))?;
+        let norm = squares.iter().sum::<f64>().sqrt();
         if !norm.is_finite() {
             return Ok(norm);
         }
         self.steps += 1;
         let scale = if norm > self.clip_norm { (self.clip_norm / norm) as f32 } else { 1.0 };
-        for (slot, grad) in &reached {
-            let step = Step {
-                grad,
-                scale,
-                moments: &slot.moments,
-                rate: rates[slot.group],
-                weight_decay: self.weight_decay,
-                correction: (1.0 - BETA.0.powf(self.steps as f64), 1.0 - BETA.1.powf(self.steps as f64)),
-            };
-            slot.var.as_tensor().inplace_op1(&step)?;
-        }
+        let (weight_decay, correction) = (self.weight_decay, [BETA.0, BETA.1].map(|beta| 1.0 - beta.powf(self.steps as f64)));
+        let step = |rate: f64| AdamStep {
+            scale,
+            beta: (BETA.0 as f32, BETA.1 as f32),
+            complement: ((1.0 - BETA.0) as f32, (1.0 - BETA.1) as f32),
+            keep: (1.0 - rate * weight_decay) as f32,
+            rate: (rate / correction[0]) as f32,
+            root: (1.0 / correction[1].sqrt()) as f32,
+            epsilon: EPSILON as f32,
+        };
+        each_slot(&mut self.slots, |slot| {
+            let Slot { var, moments, grad, reached: true, group, .. } = slot else { return Ok(()) };
+            Ok(var.as_tensor().inplace_op1(&Step { step: step(rates[*group]), grad, moments: RefCell::new(moments) })?)
+        })?;
         Ok(norm)
     }
 
@@ -117,10 +146,9 @@ impl Adam {
     /// # Errors
     /// If a tensor operation fails.
     pub fn save(&self, tensors: &mut BTreeMap<String, Tensor>) -> Result<u64> {
-        for (name, slot) in &self.slots {
-            let moments = slot.moments.borrow();
-            for (prefix, values) in ["m", "v"].iter().zip(moments.iter()) {
-                tensors.insert(format!("{prefix}.{name}"), Tensor::from_slice(values, slot.var.shape(), slot.var.device())?);
+        for slot in &self.slots {
+            for (prefix, values) in ["m", "v"].iter().zip(&slot.moments) {
+                tensors.insert(format!("{prefix}.{}", slot.name), Tensor::from_slice(values, slot.var.shape(), slot.var.device())?);
             }
         }
         Ok(self.steps)
@@ -131,27 +159,40 @@ impl Adam {
     /// # Errors
     /// If a moment is missing.
     pub fn restore(&mut self, tensors: &BTreeMap<String, Tensor>, steps: u64) -> Result<()> {
-        for (name, slot) in &self.slots {
+        for slot in &mut self.slots {
             let moment = |prefix: &str| -> Result<Vec<f32>> {
-                let name = format!("{prefix}.{name}");
+                let name = format!("{prefix}.{}", slot.name);
                 let tensor = tensors.get(&name).with_context(|| format!("the training state lacks {name}"))?;
                 Ok(tensor.flatten_all()?.to_vec1()?)
             };
-            *slot.moments.borrow_mut() = [moment("m")?, moment("v")?];
+            slot.moments = [moment("m")?, moment("v")?];
         }
         self.steps = steps;
         Ok(())
     }
 }
 
+/// What `work` gives for each slot, in order; halves of the parameters side by side, for what is done here waits for the memory.
+fn each_slot<R: Send>(slots: &mut [Slot], work: impl Fn(&mut Slot) -> Result<R> + Sync) -> Result<Vec<R>> {
+    let total: usize = slots.iter().map(|slot| slot.grad.len()).sum();
+    let mut sum = 0;
+    let half = slots.iter().take_while(|slot| {
+        sum += slot.grad.len();
+        sum <= total / 2
+    });
+    let half = half.count();
+    let (low, high) = slots.split_at_mut(half);
+    let work = &work;
+    let jobs = [low, high].into_iter().map(|slots| move || slots.iter_mut().map(work).collect::<Result<Vec<R>>>()).collect();
+    let results: Result<Vec<Vec<R>>> = side_by_side(jobs)?.into_iter().collect();
+    Ok(results?.into_iter().flatten().collect())
+}
+
 /// Adam on one variable, as an operation on its storage.
 struct Step<'a> {
+    step: AdamStep,
     grad: &'a [f32],
-    scale: f32,
-    moments: &'a RefCell<[Vec<f32>; 2]>,
-    rate: f64,
-    weight_decay: f64,
-    correction: (f64, f64),
+    moments: RefCell<&'a mut [Vec<f32>; 2]>,
 }
 
 impl InplaceOp1 for Step<'_> {
@@ -163,19 +204,8 @@ impl InplaceOp1 for Step<'_> {
         let (CpuStorage::F32(values), Some((from, to))) = (storage, layout.contiguous_offsets()) else {
             candle_core::bail!("a variable is a contiguous f32 tensor: is a bug");
         };
-        let [first, second] = &mut *self.moments.borrow_mut();
-        let keep = (1.0 - self.rate * self.weight_decay) as f32;
-        // Complements in f64: 1 - .999 in f32 is off by 5e-5 of itself.
-        let (b1, b2) = ((BETA.0 as f32, (1.0 - BETA.0) as f32), (BETA.1 as f32, (1.0 - BETA.1) as f32));
-        let rate = (self.rate / self.correction.0) as f32;
-        let (root, epsilon) = ((1.0 / self.correction.1.sqrt()) as f32, EPSILON as f32);
-        let moments = first.iter_mut().zip(second.iter_mut());
-        for ((value, grad), (m, v)) in values[from..to].iter_mut().zip(self.grad).zip(moments) {
-            let grad = grad * self.scale;
-            *m = b1.0 * *m + b1.1 * grad;
-            *v = b2.0 * *v + b2.1 * grad * grad;
-            *value = keep * *value - rate * *m / (v.sqrt() * root + epsilon);
-        }
+        let [first, second] = &mut **self.moments.borrow_mut();
+        adam(self.step, &mut values[from..to], self.grad, first, second);
         Ok(())
     }
 }
@@ -208,8 +238,7 @@ impl Ema {
     pub fn update(&mut self, vars: &BTreeMap<String, Var>, step: usize) -> Result<()> {
         let share = (1.0 - self.decay(step)) as f32;
         for (name, average) in &mut self.values {
-            let values: Vec<f32> = vars[name].flatten_all()?.to_vec1()?;
-            average.iter_mut().zip(values).for_each(|(average, value)| *average += share * (value - *average));
+            toward(average, &values(vars[name].as_tensor())?, share);
         }
         Ok(())
     }
@@ -261,7 +290,7 @@ mod tests {
         let mut expected = [1.0_f64, -2.0];
         let mut moments = [[0.0_f64; 2]; 2];
         for step in 1..=2 {
-            adam.step(&quadratic(&var, 0.25), &[0.1]).unwrap();
+            adam.step(&[quadratic(&var, 0.125), quadratic(&var, 0.125)], &[0.1]).unwrap();
             for i in 0..2 {
                 let grad = 0.5 * expected[i];
                 moments[0][i] = 0.9 * moments[0][i] + 0.1 * grad;
@@ -282,13 +311,13 @@ mod tests {
         let vars = BTreeMap::from([("a".to_string(), a.clone()), ("b".to_string(), b.clone())]);
         let mut adam = Adam::new(&vars, |name| usize::from(name == "b"), 0.0, 1.0);
         let loss = (a.sqr().unwrap() + b.sqr().unwrap()).unwrap().sum_all().unwrap().affine(0.5, 0.0).unwrap();
-        let norm = adam.step(&loss.backward().unwrap(), &[0.1, 0.0]).unwrap();
+        let norm = adam.step(&[loss.backward().unwrap()], &[0.1, 0.0]).unwrap();
         assert!((norm - 5.0).abs() < 1e-6);
-        let first = adam.slots["a"].moments.borrow()[0][0];
+        let first = adam.slots[0].moments[0][0];
         assert!((first - 0.1 * 0.6).abs() < 1e-6, "the clipped gradient of a is .6, its first moment {first}");
         assert_eq!(b.to_vec1::<f32>().unwrap(), [4.0], "group 1 has learning rate 0");
         let before = a.to_vec1::<f32>().unwrap();
-        let norm = adam.step(&quadratic(&a, f64::NAN), &[0.1, 0.1]).unwrap();
+        let norm = adam.step(&[quadratic(&a, f64::NAN)], &[0.1, 0.1]).unwrap();
         assert!(norm.is_nan());
         assert_eq!(a.to_vec1::<f32>().unwrap(), before);
     }

@@ -10,6 +10,7 @@ use super::{
     probe::{Evidence, Subjects, latent_probe},
     recipe::{Gate, Recipe, Stage1},
 };
+use crate::model::Networks;
 use crate::model::{
     latent::{
         LatentModel,
@@ -61,13 +62,13 @@ impl<'a> ElboTask<'a> {
     ///
     /// # Errors
     /// If a tensor operation fails.
-    pub fn loss(&self, learner: &Learner, batch: &ElboBatch, kl_weight: f64) -> Result<(Tensor, Scalars)> {
+    pub fn loss(&self, networks: &Networks, batch: &ElboBatch, kl_weight: f64) -> Result<(Tensor, Scalars)> {
         let options = ElboOptions {
             kl_weight,
             state_change_std: self.task.config.normalizer.state_change_std.clone(),
             reward_weight: self.stage.reward_weight,
         };
-        let latent = learner.networks.latent.as_ref().context("stage 1 needs a latent model: is a bug")?;
+        let latent = networks.latent.as_ref().context("stage 1 needs a latent model: is a bug")?;
         let terms = latent.elbo(batch, &options)?;
         let scalar = |tensor: &Tensor| -> Result<f64> { Ok(f64::from(tensor.to_scalar::<f32>()?)) };
         let scalars = vec![
@@ -86,9 +87,9 @@ impl<'a> ElboTask<'a> {
     pub fn step(&self, learner: &mut Learner) -> Result<Scalars> {
         let step = learner.position.step;
         let batch = self.batch(&mut learner.position.stream(self.task.recipe.seed))?;
-        let (loss, mut scalars) = self.loss(learner, &batch, self.stage.kl_weight.at(step))?;
+        let (loss, mut scalars) = self.loss(&learner.networks, &batch, self.stage.kl_weight.at(step))?;
         let rate = self.stage.learning_rate.at(step, self.stage.steps);
-        let norm = learner.adam.step(&loss.backward()?, &[rate, 0.0])?;
+        let norm = learner.adam.step(&[loss.backward()?], &[rate, 0.0])?;
         scalars.extend([("grad_norm", norm), ("learning_rate", rate)]);
         Ok(scalars)
     }

@@ -4,15 +4,25 @@ use super::{
     Task,
     dataset::window::{Places, WindowShape, windows},
     learner::{Learner, Scalars},
+    parallel::side_by_side,
     stage1::ElboTask,
 };
-use crate::model::{Networks, diffusion::refine::RefineOptions, noise::Philox};
+use crate::model::{
+    Networks,
+    diffusion::refine::{RefineOptions, WindowBatch},
+    noise::Philox,
+};
 use anyhow::Result;
+use candle_core::backprop::GradStore;
 
 /// Seed of the held-out batches: the same for all runs, so that their errors can be compared.
 const HELD_OUT_SEED: u64 = 0xE7A1;
 /// Held-out windows for each row of the ladder.
 const HELD_OUT_WINDOWS: usize = 256;
+
+/// Parts of a batch whose gradients are computed side by side. A fixed number: another one adds up in another order, and a run must end
+/// in the same bytes on every machine.
+const SHARDS: usize = 2;
 
 /// Draws windows and evaluates the loss.
 pub struct RefineTask<'a> {
@@ -21,6 +31,15 @@ pub struct RefineTask<'a> {
     places: Places,
     options: RefineOptions,
     elbo: Option<ElboTask<'a>>,
+}
+
+/// What one job of a step gives.
+struct Part {
+    grads: GradStore,
+    /// Error and number of windows with prior and with refined latents.
+    sums: [(f64, usize); 2],
+    loss: f64,
+    scalars: Scalars,
 }
 
 impl<'a> RefineTask<'a> {
@@ -50,25 +69,45 @@ impl<'a> RefineTask<'a> {
         let (stage, step) = (&self.task.recipe.stage2, learner.position.step);
         let mut rng = learner.position.stream(self.task.recipe.seed);
         let batch = windows(&self.task.split.train, &self.places, &self.shape, None, &mut rng)?;
-        let terms = learner.networks.refine_loss(&self.task.config, &batch, &self.options)?;
-        let mut scalars = vec![
-            ("loss", f64::from(terms.loss.to_scalar::<f32>()?)),
-            ("loss_prior", f64::from(terms.prior.0)),
-            ("loss_posterior", f64::from(terms.posterior.0)),
-        ];
-        let mut loss = terms.loss;
-        if let (Some(elbo), Some(stage1)) = (&self.elbo, &self.task.recipe.stage1) {
-            let (term, parts) = elbo.loss(learner, &elbo.batch(&mut rng)?, stage1.kl_weight.end)?;
-            loss = (loss + term.affine(stage.elbo_weight, 0.0)?)?;
-            scalars.extend(parts);
+        let elbo = self.elbo.as_ref().zip(self.task.recipe.stage1.as_ref());
+        let elbo = elbo.map(|(elbo, stage1)| Ok::<_, anyhow::Error>((elbo, elbo.batch(&mut rng)?, stage1.kl_weight.end))).transpose()?;
+        let (networks, weight) = (&learner.networks, stage.elbo_weight);
+        let mut jobs: Vec<Box<dyn FnOnce() -> Result<Part> + Send>> = Vec::new();
+        for shard in 0..SHARDS {
+            let batch = &batch;
+            jobs.push(Box::new(move || self.shard(networks, batch, shard)));
         }
+        if let Some((elbo, batch, kl_weight)) = &elbo {
+            jobs.push(Box::new(move || {
+                let (loss, scalars) = elbo.loss(networks, batch, *kl_weight)?;
+                Ok(Part { grads: loss.affine(weight, 0.0)?.backward()?, sums: [(0.0, 0); 2], loss: 0.0, scalars })
+            }));
+        }
+        let parts = side_by_side(jobs)?.into_iter().collect::<Result<Vec<Part>>>()?;
+        let mean = |which: usize| {
+            let (sum, count) = parts.iter().map(|part| part.sums[which]).fold((0.0, 0), |(a, n), (b, m)| (a + b, n + m));
+            if count == 0 { 0.0 } else { sum / count as f64 }
+        };
+        let mut scalars = vec![("loss", parts.iter().map(|part| part.loss).sum()), ("loss_prior", mean(0)), ("loss_posterior", mean(1))];
+        scalars.extend(parts.iter().flat_map(|part| part.scalars.iter().copied()));
         let rate = stage.learning_rate.at(step, stage.steps);
-        let norm = learner.adam.step(&loss.backward()?, &[rate * stage.latent_lr_factor, rate])?;
+        let grads: Vec<GradStore> = parts.into_iter().map(|part| part.grads).collect();
+        let norm = learner.adam.step(&grads, &[rate * stage.latent_lr_factor, rate])?;
         if let Some(ema) = learner.ema.as_mut().filter(|_| norm.is_finite()) {
             ema.update(&learner.vars, step)?;
         }
         scalars.extend([("grad_norm", norm), ("learning_rate", rate)]);
         Ok(scalars)
+    }
+
+    /// Loss and gradients of one shard of a batch, weighted by its share.
+    fn shard(&self, networks: &Networks, batch: &WindowBatch, shard: usize) -> Result<Part> {
+        let count = batch.rows.len();
+        let (start, end) = (shard * count / SHARDS, (shard + 1) * count / SHARDS);
+        let terms = networks.refine_loss(&self.task.config, &batch.narrow(start, end - start)?, &self.options)?;
+        let loss = terms.loss.affine((end - start) as f64 / count as f64, 0.0)?;
+        let sums = [terms.prior, terms.posterior].map(|(mean, count)| (f64::from(mean) * count as f64, count));
+        Ok(Part { grads: loss.backward()?, sums, loss: f64::from(loss.to_scalar::<f32>()?), scalars: Vec::new() })
     }
 
     /// Denoising error of held-out windows at each row of the ladder, with the latents that the sampler has there.

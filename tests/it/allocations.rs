@@ -75,9 +75,9 @@ fn a_tick_allocates_nothing() {
         let options = |i: u64| SamplerOptions {
             eta: 1.0,
             kappa: [0.0, 0.01, f32::INFINITY][i as usize % 3],
-            latent: if i % 2 == 0 { LatentMode::Mean } else { LatentMode::Sample },
+            latent: if i.is_multiple_of(2) { LatentMode::Mean } else { LatentMode::Sample },
             action_horizon: 1 + i as usize % 3,
-            streaming: i % 4 != 0,
+            streaming: !i.is_multiple_of(4),
             ..SamplerOptions::default()
         };
         let episodes: Vec<Episode> = (0..9).map(|i| agent.open(i, &options(i)).unwrap()).collect();

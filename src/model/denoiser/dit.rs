@@ -17,7 +17,8 @@ struct Block {
     qkv: Linear,
     out: Linear,
     mlp: [Linear; 2],
-    ada: Linear,
+    /// Shift and scale, then the gate, of attention and of the MLP.
+    ada: [Linear; 4],
     heads: usize,
 }
 
@@ -28,19 +29,19 @@ impl Block {
             qkv: Linear::new(width, 3 * width, &params.scope("qkv"))?,
             out: Linear::new(width, width, &params.scope("out"))?,
             mlp: [Linear::new(width, 4 * width, &params.scope("mlp.0"))?, Linear::new(4 * width, width, &params.scope("mlp.2"))?],
-            ada: zero_linear(width, 6 * width, &params.scope("ada"))?,
+            ada: Linear::parts(width, [2 * width, width, 2 * width, width], Init::Const(0.0), &params.scope("ada"))?,
             heads,
         })
     }
 
     fn forward<V: Value>(&self, x: V, cond: &V) -> Result<V> {
-        let ada = self.ada.forward(cond)?;
-        let h = self.norm.forward(&x)?.modulated(&ada, 0)?;
+        let [modulate, gate, modulate_mlp, gate_mlp] = &self.ada;
+        let h = self.norm.forward(&x)?.modulated(&modulate.forward(cond)?)?;
         let h = self.out.forward(&self.qkv.forward(&h)?.attention(self.heads)?)?;
-        let x = x.plus_gated(&h, &ada, 2)?;
-        let h = self.norm.forward(&x)?.modulated(&ada, 3)?;
+        let x = x.plus_gated(&h, &gate.forward(cond)?)?;
+        let h = self.norm.forward(&x)?.modulated(&modulate_mlp.forward(cond)?)?;
         let h = self.mlp[1].forward(&self.mlp[0].forward(&h)?.activated(GeluTanh)?)?;
-        x.plus_gated(&h, &ada, 5)
+        x.plus_gated(&h, &gate_mlp.forward(cond)?)
     }
 }
 
@@ -83,7 +84,7 @@ impl Dit {
             x = block.forward(x, &cond)?;
         }
         let ada = self.ada.forward(&cond)?;
-        self.out.forward(&self.norm.forward(&x)?.modulated(&ada, 0)?)
+        self.out.forward(&self.norm.forward(&x)?.modulated(&ada)?)
     }
 
     /// `(B, T, width)`: level of each position, its inputs, and the real steps.

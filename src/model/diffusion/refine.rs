@@ -56,6 +56,25 @@ pub struct WindowBatch {
     pub noise: Tensor,
 }
 
+impl WindowBatch {
+    /// Windows `start..start + len` alone.
+    ///
+    /// # Errors
+    /// If there are not so many.
+    pub fn narrow(&self, start: usize, len: usize) -> Result<Self> {
+        let cut = |tensor: &Tensor| tensor.narrow(0, start, len)?.contiguous();
+        let Tokens { state, action, reward, present, noise } = &self.history;
+        Ok(Self {
+            history: Tokens { state: cut(state)?, action: cut(action)?, reward: cut(reward)?, present: cut(present)?, noise: cut(noise)? },
+            window: cut(&self.window)?,
+            observed: self.observed.as_ref().map(cut).transpose()?,
+            rows: self.rows[start..start + len].to_vec(),
+            inpaint: self.inpaint[start..start + len].to_vec(),
+            noise: cut(&self.noise)?,
+        })
+    }
+}
+
 /// Scalars of one evaluation.
 pub struct RefineTerms {
     /// What is minimised: weighted mean square error of x0.

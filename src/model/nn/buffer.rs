@@ -8,7 +8,7 @@ use super::{
     kernels::{
         activation::{self, Activation},
         attention::Attention,
-        join::{self, Columns},
+        join,
         pool::Pooled,
     },
     norm::{GroupNormMish, LayerNorm},
@@ -39,14 +39,6 @@ impl Buffer {
             bail!("expected {shape:?}, got {:?}", self.shape);
         }
         Ok(())
-    }
-
-    /// Chunks `part..part + count` of `width` columns of every row.
-    fn chunks(&self, like: &Self, part: usize, count: usize) -> Result<Columns<'_>> {
-        if self.shape[..2] != like.shape[..2] || (part + count) * like.width() > self.width() {
-            bail!("{:?} has no chunks {part}..{} for {:?}", self.shape, part + count, like.shape);
-        }
-        Ok(Columns { values: &self.values, width: self.width(), from: part * like.width() })
     }
 }
 
@@ -137,16 +129,17 @@ impl Value for Buffer {
         Ok(self)
     }
 
-    fn modulated(mut self, ada: &Self, part: usize) -> Result<Self> {
-        let (columns, channels) = (ada.chunks(&self, part, 2)?, self.width());
-        join::modulate(&mut self.values, columns, channels);
+    fn modulated(mut self, ada: &Self) -> Result<Self> {
+        let [batch, steps, channels] = self.shape;
+        ada.expect([batch, steps, 2 * channels])?;
+        join::modulate(&mut self.values, ada, channels);
         Ok(self)
     }
 
-    fn plus_gated(mut self, h: &Self, ada: &Self, part: usize) -> Result<Self> {
+    fn plus_gated(mut self, h: &Self, gate: &Self) -> Result<Self> {
         h.expect(self.shape)?;
-        let (columns, channels) = (ada.chunks(&self, part, 1)?, self.width());
-        join::add_gated(&mut self.values, h, columns, channels);
+        gate.expect(self.shape)?;
+        join::add_gated(&mut self.values, h, gate);
         Ok(self)
     }
 

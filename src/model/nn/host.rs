@@ -3,8 +3,8 @@
 use candle_core::{CpuStorage, Layout, Result, Shape, Storage, Tensor};
 use std::ops::Deref;
 
-/// A tensor's values, held for reading.
-pub(super) struct Values<G> {
+/// A tensor's values, held for reading; nobody can write them meanwhile.
+pub struct Values<G> {
     storage: G,
     range: (usize, usize),
 }
@@ -21,7 +21,10 @@ impl<G: Deref<Target = Storage>> Deref for Values<G> {
 }
 
 /// The values of a contiguous f32 tensor on the CPU.
-pub(super) fn values(tensor: &Tensor) -> Result<Values<impl Deref<Target = Storage>>> {
+///
+/// # Errors
+/// If it is another tensor.
+pub fn values(tensor: &Tensor) -> Result<Values<impl Deref<Target = Storage>>> {
     let (storage, layout) = tensor.storage_and_layout();
     match &*storage {
         Storage::Cpu(inner) => slice(inner, layout)?,

@@ -3,7 +3,7 @@
 use super::{
     conv1d::Grads3,
     host::{grad_like, output, slice, values},
-    kernels::join::{self, Columns},
+    kernels::join,
 };
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor};
 
@@ -17,27 +17,20 @@ pub(super) fn add_at_each_step(x: &Tensor, e: &Tensor) -> Result<Tensor> {
 }
 
 /// See [`super::Value::modulated`].
-pub(super) fn modulate(x: &Tensor, ada: &Tensor, part: usize) -> Result<Tensor> {
-    check_chunks(x, ada, part + 2)?;
-    x.contiguous()?.apply_op2(&ada.contiguous()?, Modulate { part })
+pub(super) fn modulate(x: &Tensor, ada: &Tensor) -> Result<Tensor> {
+    let (batch, steps, channels) = x.dims3()?;
+    if ada.dims3()? != (batch, steps, 2 * channels) {
+        candle_core::bail!("{:?} does not hold shift and scale for {:?}", ada.shape(), x.shape());
+    }
+    x.contiguous()?.apply_op2(&ada.contiguous()?, Modulate)
 }
 
 /// See [`super::Value::plus_gated`].
-pub(super) fn add_gated(x: &Tensor, h: &Tensor, ada: &Tensor, part: usize) -> Result<Tensor> {
-    check_chunks(x, ada, part + 1)?;
-    if h.shape() != x.shape() {
-        candle_core::bail!("cannot add {:?} to {:?}", h.shape(), x.shape());
+pub(super) fn add_gated(x: &Tensor, h: &Tensor, gate: &Tensor) -> Result<Tensor> {
+    if h.shape() != x.shape() || gate.shape() != x.shape() {
+        candle_core::bail!("cannot add {:?} by {:?} to {:?}", h.shape(), gate.shape(), x.shape());
     }
-    x.contiguous()?.apply_op3(&h.contiguous()?, &ada.contiguous()?, AddGated { part })
-}
-
-/// Whether the rows of `ada` hold `parts` chunks as wide as the rows of `x`.
-fn check_chunks(x: &Tensor, ada: &Tensor, parts: usize) -> Result<()> {
-    let ((batch, steps, channels), (ada_batch, ada_steps, width)) = (x.dims3()?, ada.dims3()?);
-    if (batch, steps) != (ada_batch, ada_steps) || parts * channels > width {
-        candle_core::bail!("{:?} does not hold {parts} chunks for {:?}", ada.shape(), x.shape());
-    }
-    Ok(())
+    x.contiguous()?.apply_op3(&h.contiguous()?, &gate.contiguous()?, AddGated)
 }
 
 /// Tensors of the same leading dimensions side by side along the last one.
@@ -113,19 +106,10 @@ impl CustomOp2 for Concat {
 }
 
 /// `x (1 + scale) + shift` as an operation on (x, ada).
-struct Modulate {
-    part: usize,
-}
+struct Modulate;
 
-/// `x + gate h` as an operation on (x, h, ada).
-struct AddGated {
-    part: usize,
-}
-
-/// Channels of `(.., channels)`.
-fn last(dims: &[usize]) -> usize {
-    dims.last().copied().unwrap_or(0)
-}
+/// `x + gate h` as an operation on (x, h, gate).
+struct AddGated;
 
 impl CustomOp2 for Modulate {
     fn name(&self) -> &'static str {
@@ -133,17 +117,17 @@ impl CustomOp2 for Modulate {
     }
 
     fn cpu_fwd(&self, s1: &CpuStorage, l1: &Layout, s2: &CpuStorage, l2: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (mut out, channels) = (slice(s1, l1)?.to_vec(), last(l1.dims()));
-        join::modulate(&mut out, Columns { values: slice(s2, l2)?, width: last(l2.dims()), from: self.part * channels }, channels);
+        let (_, _, channels) = l1.shape().dims3()?;
+        let mut out = slice(s1, l1)?.to_vec();
+        join::modulate(&mut out, slice(s2, l2)?, channels);
         output(out, l1.shape())
     }
 
     fn bwd(&self, x: &Tensor, ada: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Grads2> {
-        let (grad, channels) = (grad.contiguous()?, last(x.dims()));
-        let (held_x, held_ada) = (values(x)?, values(ada)?);
-        let columns = Columns { values: &held_ada, width: last(ada.dims()), from: self.part * channels };
+        let grad = grad.contiguous()?;
+        let (_, _, channels) = x.dims3()?;
         let (mut dx, mut d_ada) = (values(&grad)?.to_vec(), vec![0.0; ada.elem_count()]);
-        join::modulate_back(&held_x, &mut dx, columns, &mut d_ada, channels);
+        join::modulate_back(&values(x)?, &mut dx, &values(ada)?, &mut d_ada, channels);
         Ok((grad_like(dx, x)?, grad_like(d_ada, ada)?))
     }
 }
@@ -162,18 +146,18 @@ impl CustomOp3 for AddGated {
         s3: &CpuStorage,
         l3: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let (mut out, channels) = (slice(s1, l1)?.to_vec(), last(l1.dims()));
-        let ada = Columns { values: slice(s3, l3)?, width: last(l3.dims()), from: self.part * channels };
-        join::add_gated(&mut out, slice(s2, l2)?, ada, channels);
+        let mut out = slice(s1, l1)?.to_vec();
+        join::add_gated(&mut out, slice(s2, l2)?, slice(s3, l3)?);
         output(out, l1.shape())
     }
 
-    fn bwd(&self, x: &Tensor, h: &Tensor, ada: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Grads3> {
-        let (grad, channels) = (grad.contiguous()?, last(x.dims()));
-        let (held_h, held_ada) = (values(h)?, values(ada)?);
-        let columns = Columns { values: &held_ada, width: last(ada.dims()), from: self.part * channels };
-        let (mut dh, mut d_ada) = (values(&grad)?.to_vec(), vec![0.0; ada.elem_count()]);
-        join::add_gated_back(&held_h, &mut dh, columns, &mut d_ada, channels);
-        Ok((Some(grad), grad_like(dh, h)?, grad_like(d_ada, ada)?))
+    fn bwd(&self, _: &Tensor, h: &Tensor, gate: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Grads3> {
+        let grad = grad.contiguous()?;
+        let held = values(&grad)?;
+        let (mut dh, mut d_gate) = (held.to_vec(), held.to_vec());
+        drop(held);
+        join::multiply(&mut dh, &values(gate)?);
+        join::multiply(&mut d_gate, &values(h)?);
+        Ok((Some(grad), grad_like(dh, h)?, grad_like(d_gate, gate)?))
     }
 }

@@ -29,6 +29,21 @@ impl Linear {
         ConvLayer::linear(weight, bias, p).map(Self)
     }
 
+    /// A layer that is used in parts: one parameter pair, `weight` `(sum of widths, d_in)` and its `bias`, as one layer for each width.
+    /// A gradient then has the size of its part.
+    ///
+    /// # Errors
+    /// Those of [`Params::get`].
+    pub fn parts<const N: usize>(d_in: usize, widths: [usize; N], init: Init, p: &Params) -> Result<[Self; N]> {
+        let (weight, bias) = (p.get((widths.iter().sum(), d_in), "weight", init)?, p.get(widths.iter().sum::<usize>(), "bias", init)?);
+        let mut layers = Vec::with_capacity(N);
+        for (i, width) in widths.into_iter().enumerate() {
+            let start = widths[..i].iter().sum();
+            layers.push(Self(ConvLayer::linear(weight.narrow(0, start, width)?, bias.narrow(0, start, width)?, p)?));
+        }
+        layers.try_into().map_err(|_| candle_core::Error::Msg("as many layers as widths: is a bug".into()))
+    }
+
     /// `(.., d_in)` to `(.., d_out)`.
     ///
     /// # Errors

@@ -12,7 +12,7 @@ mod buffer;
 mod candle_faults;
 pub mod conv1d;
 pub mod gru;
-mod host;
+pub mod host;
 mod join;
 pub mod kernels;
 pub mod linear;

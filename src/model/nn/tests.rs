@@ -28,6 +28,14 @@ fn layers() -> Vec<(&'static str, Tensor, Layer)> {
     let layer_norm = |affine| -> Layer { Box::new(move |x, p| LayerNorm::new(19, affine, 1e-6, p)?.forward(x)) };
     vec![
         ("linear", gaussian(1, (7, 5)), Box::new(|x, p| Linear::new(5, 67, p)?.forward(x))),
+        (
+            "linear in parts",
+            gaussian(15, (7, 2, 5)),
+            Box::new(|x, p| {
+                let [a, b] = Linear::parts(5, [3, 18], Init::FanIn(5), p)?;
+                Tensor::cat(&[b.forward(x)?, a.forward(x)?], 2)
+            }),
+        ),
         ("linear, three dimensions", gaussian(2, (3, 2, 18)), Box::new(|x, p| Linear::new(18, 3, p)?.forward(x))),
         ("convolution", gaussian(3, (3, 7, 4)), convolution(conv(4, 18, 5, 1, 2))),
         ("convolution without padding", gaussian(4, (2, 6, 3)), convolution(conv(3, 5, 3, 1, 0))),
@@ -130,10 +138,10 @@ fn attention_against_central_differences() {
 #[test]
 fn joins_against_central_differences() {
     let (x, e, y) = (gaussian(1, (2, 3, 5)), gaussian(2, (2, 1, 5)), gaussian(3, (2, 3, 4)));
-    let (h, ada) = (gaussian(4, (2, 3, 5)), gaussian(5, (2, 3, 20)));
+    let (h, ada) = (gaussian(4, (2, 3, 5)), gaussian(5, (2, 3, 10)));
     check_gradients(&[x.clone(), e.clone()], &|inputs| inputs[0].clone().plus_at_each_step(&inputs[1]));
-    check_gradients(&[x.clone(), ada.clone()], &|inputs| inputs[0].clone().modulated(&inputs[1], 2));
-    check_gradients(&[x.clone(), h, ada], &|inputs| inputs[0].clone().plus_gated(&inputs[1], &inputs[2], 3));
+    check_gradients(&[x.clone(), ada.clone()], &|inputs| inputs[0].clone().modulated(&inputs[1]));
+    check_gradients(&[x.clone(), h.clone(), (h * 0.7).unwrap()], &|inputs| inputs[0].clone().plus_gated(&inputs[1], &inputs[2]));
     check_gradients(&[x.clone(), y.clone()], &|inputs| concat_channels(&[&inputs[0], &inputs[1], &inputs[0]]));
     let expected = Tensor::cat(&[&x, &y], 2).unwrap();
     assert_eq!(bits(&concat_channels(&[&x, &y]).unwrap()), bits(&expected));
@@ -174,7 +182,7 @@ fn wrong_shapes_are_errors() {
     assert!(attention(&gaussian(1, (2, 4, 8)), 2).is_err());
     assert!(concat_channels(&[&gaussian(1, (2, 4, 8)), &gaussian(1, (2, 3, 8))]).is_err());
     assert!(gaussian(1, (2, 4, 8)).plus_at_each_step(&gaussian(1, (2, 1, 7))).is_err());
-    assert!(gaussian(1, (2, 4, 8)).modulated(&gaussian(1, (2, 4, 16)), 1).is_err());
+    assert!(gaussian(1, (2, 4, 8)).modulated(&gaussian(1, (2, 4, 8))).is_err());
 }
 
 /// `tests/golden/make_nn.py` tells how PyTorch made these numbers, in float64.

@@ -76,17 +76,17 @@ pub trait Value: Clone {
     /// If shapes differ.
     fn plus_at_each_step(self, e: &Self) -> Result<Self>;
 
-    /// `self (1 + scale) + shift`, where shift is the chunk number `part` of `ada` (chunks as wide as `self`) and scale the one behind it.
+    /// `self (1 + scale) + shift`, where `ada`, twice as wide as `self`, holds shift and scale side by side.
     ///
     /// # Errors
     /// If shapes differ.
-    fn modulated(self, ada: &Self, part: usize) -> Result<Self>;
+    fn modulated(self, ada: &Self) -> Result<Self>;
 
-    /// `self + gate h`, where the gate is the chunk number `part` of `ada`.
+    /// `self + gate h`.
     ///
     /// # Errors
     /// If shapes differ.
-    fn plus_gated(self, h: &Self, ada: &Self, part: usize) -> Result<Self>;
+    fn plus_gated(self, h: &Self, gate: &Self) -> Result<Self>;
 
     /// Side by side along the channels.
     ///
@@ -167,12 +167,12 @@ impl Value for Tensor {
         join::add_at_each_step(&self, e)
     }
 
-    fn modulated(self, ada: &Self, part: usize) -> Result<Self> {
-        join::modulate(&self, ada, part)
+    fn modulated(self, ada: &Self) -> Result<Self> {
+        join::modulate(&self, ada)
     }
 
-    fn plus_gated(self, h: &Self, ada: &Self, part: usize) -> Result<Self> {
-        join::add_gated(&self, h, ada, part)
+    fn plus_gated(self, h: &Self, gate: &Self) -> Result<Self> {
+        join::add_gated(&self, h, gate)
     }
 
     fn beside(parts: &[&Self]) -> Result<Self> {

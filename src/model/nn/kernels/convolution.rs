@@ -60,7 +60,7 @@ impl ConvShape {
     pub fn pack_gather(&self, weight: &[f32]) -> Packed {
         let row = self.c_in * self.kernel;
         let k_offset: Vec<usize> = (0..self.kernel).flat_map(|tap| (0..self.c_in).map(move |c| c * self.kernel + tap)).collect();
-        Packed::new(weight, (Table(&k_offset), k_offset.len()), (self.c_out, row))
+        Packed::interleaved(weight, (Table(&k_offset), k_offset.len()), (self.c_out, row), self.kernel)
     }
 
     /// The weights for [`Convolution::spread`].
@@ -68,8 +68,9 @@ impl ConvShape {
         let row = self.c_in * self.kernel;
         let phase = |residue: usize| {
             let taps = (residue..self.kernel).step_by(self.stride).rev();
+            let count = taps.len();
             let k_offset: Vec<usize> = taps.flat_map(|tap| (0..self.c_out).map(move |o| o * row + tap)).collect();
-            Packed::new(weight, (Table(&k_offset), k_offset.len()), (self.c_in, self.kernel))
+            Packed::interleaved(weight, (Table(&k_offset), k_offset.len()), (self.c_in, self.kernel), count)
         };
         Phases((0..self.stride).map(phase).collect())
     }

@@ -27,67 +27,41 @@ per_isa! {
     }
 }
 
-/// Shift, scale and gate of rows: columns `[from, from + channels)` of each row of `values`, and the `channels` after them.
-#[derive(Clone, Copy, Debug)]
-pub struct Columns<'a> {
-    /// `(rows, width)`.
-    pub values: &'a [f32],
-    /// Width of a row.
-    pub width: usize,
-    /// First column.
-    pub from: usize,
+per_isa! {
+    /// `x[i] *= y[i]`.
+    pub fn multiply(x: &mut [f32], y: &[f32]) {
+        x.iter_mut().zip(y).for_each(|(x, y)| *x *= y);
+    }
 }
 
 per_isa! {
-    /// `x = x (1 + scale) + shift`, `x` `(rows, channels)`; shift stands at `ada.from`, scale behind it.
-    pub fn modulate(x: &mut [f32], ada: Columns, channels: usize) {
-        for (x, ada_row) in x.chunks_exact_mut(channels).zip(ada.values.chunks_exact(ada.width)) {
-            let (shift, scale) = ada_row[ada.from..ada.from + 2 * channels].split_at(channels);
+    /// `x = x (1 + scale) + shift`, `x` `(rows, channels)`, `ada` `(rows, 2 channels)`: shift, then scale.
+    pub fn modulate(x: &mut [f32], ada: &[f32], channels: usize) {
+        for (x, ada) in x.chunks_exact_mut(channels).zip(ada.chunks_exact(2 * channels)) {
+            let (shift, scale) = ada.split_at(channels);
             x.iter_mut().zip(shift.iter().zip(scale)).for_each(|(x, (shift, scale))| *x = x.mul_add(scale + 1.0, *shift));
         }
     }
 }
 
 per_isa! {
-    /// `x += gate h`, all `(rows, channels)`; the gate stands at `ada.from`.
-    pub fn add_gated(x: &mut [f32], h: &[f32], ada: Columns, channels: usize) {
-        let rows = x.chunks_exact_mut(channels).zip(h.chunks_exact(channels));
-        for ((x, h), ada_row) in rows.zip(ada.values.chunks_exact(ada.width)) {
-            let gate = &ada_row[ada.from..ada.from + channels];
-            x.iter_mut().zip(h.iter().zip(gate)).for_each(|(x, (h, gate))| *x = gate.mul_add(*h, *x));
-        }
+    /// `x += gate h`.
+    pub fn add_gated(x: &mut [f32], h: &[f32], gate: &[f32]) {
+        x.iter_mut().zip(h.iter().zip(gate)).for_each(|(x, (h, gate))| *x = gate.mul_add(*h, *x));
     }
 }
 
 per_isa! {
-    /// Gradients of [`modulate`]: `dx` holds that of the result and becomes that of `x`; `d_ada`, zeros, takes those of shift and scale.
-    pub fn modulate_back(x: &[f32], dx: &mut [f32], ada: Columns, d_ada: &mut [f32], channels: usize) {
+    /// Gradients of [`modulate`]: `dx` holds that of the result and becomes that of `x`; `d_ada` takes those of shift and scale.
+    pub fn modulate_back(x: &[f32], dx: &mut [f32], ada: &[f32], d_ada: &mut [f32], channels: usize) {
         let rows = x.chunks_exact(channels).zip(dx.chunks_exact_mut(channels));
-        let ada_rows = ada.values.chunks_exact(ada.width).zip(d_ada.chunks_exact_mut(ada.width));
-        for ((x, dx), (ada_row, d_row)) in rows.zip(ada_rows) {
-            let scale = &ada_row[ada.from + channels..ada.from + 2 * channels];
-            let (d_shift, d_scale) = d_row[ada.from..ada.from + 2 * channels].split_at_mut(channels);
+        for ((x, dx), (ada, d_ada)) in rows.zip(ada.chunks_exact(2 * channels).zip(d_ada.chunks_exact_mut(2 * channels))) {
+            let (d_shift, d_scale) = d_ada.split_at_mut(channels);
             d_shift.copy_from_slice(dx);
-            let columns = x.iter().zip(dx.iter_mut()).zip(scale.iter().zip(d_scale));
+            let columns = x.iter().zip(dx.iter_mut()).zip(ada[channels..].iter().zip(d_scale));
             for ((x, dx), (scale, d_scale)) in columns {
                 *d_scale = x * *dx;
                 *dx *= scale + 1.0;
-            }
-        }
-    }
-}
-
-per_isa! {
-    /// Gradients of [`add_gated`]: `dh` holds that of the result and becomes that of `h`; `d_ada`, zeros, takes that of the gate.
-    pub fn add_gated_back(h: &[f32], dh: &mut [f32], ada: Columns, d_ada: &mut [f32], channels: usize) {
-        let rows = h.chunks_exact(channels).zip(dh.chunks_exact_mut(channels));
-        let ada_rows = ada.values.chunks_exact(ada.width).zip(d_ada.chunks_exact_mut(ada.width));
-        for ((h, dh), (ada_row, d_row)) in rows.zip(ada_rows) {
-            let (gate, d_gate) = (&ada_row[ada.from..ada.from + channels], &mut d_row[ada.from..ada.from + channels]);
-            let columns = h.iter().zip(dh.iter_mut()).zip(gate.iter().zip(d_gate));
-            for ((h, dh), (gate, d_gate)) in columns {
-                *d_gate = h * *dh;
-                *dh *= gate;
             }
         }
     }

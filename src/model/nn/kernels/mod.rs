@@ -11,6 +11,7 @@ pub mod gru;
 pub mod join;
 pub mod math;
 pub mod norm;
+pub mod optimizer;
 pub mod pool;
 pub mod product;
 

@@ -86,14 +86,22 @@ impl Packed {
     /// Packs `k` terms of `columns` columns: `B(k, j) = values[terms.at(k) + j * column_stride]`.
     pub fn new<T: Terms>(values: &[f32], (terms, k): (T, usize), (columns, column_stride): (usize, usize)) -> Self {
         let mut lanes = vec![Lane::default(); k * columns.div_ceil(LANE)];
-        pack(values, (terms, k), (columns, column_stride), &mut lanes);
+        pack(values, (terms, k), (columns, column_stride), 1, &mut lanes);
+        Self { k, n: columns, lanes: Lanes::F32(lanes) }
+    }
+
+    /// The same for terms of which `k / passes` neighbours in memory belong to one pass (channels to a tap): the memory is read in its
+    /// own order.
+    pub fn interleaved<T: Terms>(values: &[f32], (terms, k): (T, usize), (columns, column_stride): (usize, usize), passes: usize) -> Self {
+        let mut lanes = vec![Lane::default(); k * columns.div_ceil(LANE)];
+        pack(values, (terms, k), (columns, column_stride), passes, &mut lanes);
         Self { k, n: columns, lanes: Lanes::F32(lanes) }
     }
 
     /// The same for one use, in memory of the pool.
     pub fn scratch<T: Terms>(values: &[f32], (terms, k): (T, usize), (columns, column_stride): (usize, usize)) -> Self {
         let mut lanes = Pooled::zeros(k * columns.div_ceil(LANE) * LANE);
-        pack(values, (terms, k), (columns, column_stride), lanes.lanes_mut());
+        pack(values, (terms, k), (columns, column_stride), 1, lanes.lanes_mut());
         Self { k, n: columns, lanes: Lanes::Scratch(lanes) }
     }
 
@@ -134,11 +142,11 @@ fn bf16_bits(value: f32) -> u16 {
 }
 
 /// Fills lanes of zeros, panel by panel.
-fn pack<T: Terms>(values: &[f32], (terms, k): (T, usize), (columns, stride): (usize, usize), lanes: &mut [Lane]) {
+fn pack<T: Terms>(values: &[f32], (terms, k): (T, usize), (columns, stride): (usize, usize), passes: usize, lanes: &mut [Lane]) {
     for (panel, start) in (0..columns).step_by(PANEL * LANE).enumerate() {
         let panel = &mut lanes[panel * PANEL * k..][..panel_width(columns, panel) * k];
         let (count, values) = (columns.min(start + PANEL * LANE) - start, &values[start * stride..]);
-        if stride == 1 { copy_rows(panel, values, terms, count) } else { copy_columns(panel, values, terms, (count, stride)) }
+        if stride == 1 { copy_rows(panel, values, terms, count) } else { copy_columns(panel, values, terms, (count, stride, passes)) }
     }
 }
 
@@ -150,13 +158,17 @@ fn copy_rows<T: Terms>(panel: &mut [Lane], values: &[f32], terms: T, columns: us
 }
 
 /// Fills a panel from columns `stride` apart: 16 columns are read side by side, so that each line is written once.
-fn copy_columns<T: Terms>(panel: &mut [Lane], values: &[f32], terms: T, (columns, stride): (usize, usize)) {
+fn copy_columns<T: Terms>(panel: &mut [Lane], values: &[f32], terms: T, (columns, stride, passes): (usize, usize, usize)) {
     let width = columns.div_ceil(LANE);
+    let per_pass = panel.len() / width / passes.max(1);
     for start in (0..columns).step_by(LANE) {
         let (count, values) = (LANE.min(columns - start), &values[start * stride..]);
-        for (k, lane) in panel[start / LANE..].iter_mut().step_by(width).enumerate() {
-            let column = values[terms.at(k)..].iter().step_by(stride);
-            lane.0[..count].iter_mut().zip(column).for_each(|(to, from)| *to = *from);
+        for i in 0..per_pass {
+            for k in (i..).step_by(per_pass).take(passes) {
+                let (lane, column) = (&mut panel[k * width + start / LANE].0[..count], &values[terms.at(k)..]);
+                assert!((count - 1) * stride < column.len(), "a column lies outside");
+                lane.iter_mut().enumerate().for_each(|(j, to)| *to = column[j * stride]);
+            }
         }
     }
 }
