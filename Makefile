@@ -9,7 +9,7 @@ ENV ?= cheetah-wind-s
 EPISODES ?= 300
 DEMO_EPISODES ?= 32
 
-.PHONY: help demo serve collect train test test-rust test-python lint bench docs proto-python tools clean
+.PHONY: help demo serve collect train test test-rust test-python lint load bench docs proto-python tools clean
 
 help: ## This list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 24
@@ -43,6 +43,9 @@ lint: venv ## Formatting, clippy, docs and ruff, all with warnings as errors.
 	RUSTDOCFLAGS="-D warnings" cargo doc $(CARGO_FLAGS) --no-deps
 	$(BIN)/ruff check clients/python tests
 	$(BIN)/ruff format --check clients/python tests
+
+load: ## Puts load on the server of `make serve`: make load LOAD="--clients 32 --seconds 10"; LOAD=--help tells more.
+	cargo run $(CARGO_FLAGS) --quiet --example load -- $(LOAD)
 
 bench: ## Kernel, forward, act and training-step times of this machine.
 	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 cargo bench --locked
