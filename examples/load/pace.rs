@@ -87,3 +87,39 @@ fn call(mut clients: Vec<Arrival>, window: Window) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Times in seconds from the start, of each client.
+    fn times(len: usize, period: f64, arrivals: Arrivals, seed: u64) -> Vec<Vec<f64>> {
+        let window = Window::from_now(Duration::ZERO, Duration::from_millis(300));
+        let since_start = |pace: Pace| {
+            let Pace::Open(mut times) = pace else { panic!("an open loop has times") };
+            std::iter::from_fn(|| times.blocking_recv()).map(|due| (due - window.start).as_secs_f64()).collect()
+        };
+        open(len, period, arrivals, seed, window).into_iter().map(since_start).collect()
+    }
+
+    #[test]
+    fn even_times_have_one_period_and_phases_of_their_own() {
+        let all = times(3, 0.01, Arrivals::Even, 1);
+        for client in &all {
+            assert!((29..=30).contains(&client.len()) && client[0] < 0.01, "{client:?}");
+            assert!(client.windows(2).all(|pair| (pair[1] - pair[0] - 0.01).abs() < 1e-6), "{client:?}");
+        }
+        assert!(all[0][0] != all[1][0] && all[1][0] != all[2][0]);
+        assert_eq!(all, times(3, 0.01, Arrivals::Even, 1), "the seed decides");
+    }
+
+    #[test]
+    fn poisson_times_scatter_around_the_period() {
+        let all = times(20, 0.002, Arrivals::Poisson, 2);
+        let gaps: Vec<f64> = all.iter().flat_map(|client| client.windows(2).map(|pair| pair[1] - pair[0])).collect();
+        let mean = gaps.iter().sum::<f64>() / gaps.len() as f64;
+        let spread = (gaps.iter().map(|gap| (gap - mean).powi(2)).sum::<f64>() / gaps.len() as f64).sqrt();
+        // About 3000 gaps: the mean of an exponential is known to 2 %, its spread (equal to the mean) to 3 %.
+        assert!((mean / 0.002 - 1.0).abs() < 0.08 && (spread / mean - 1.0).abs() < 0.12, "{mean} {spread}");
+    }
+}

@@ -134,3 +134,45 @@ impl Counts {
         self.server_us.iter_mut().zip(parts).for_each(|(sum, part)| *sum += part);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: Duration = Duration::from_secs(1);
+
+    /// A window that began five seconds ago and goes on.
+    fn tally() -> Tally {
+        let now = Instant::now();
+        Tally::new(Window { start: now - 6 * SECOND, begin: now - 5 * SECOND, end: now + 60 * SECOND })
+    }
+
+    #[test]
+    fn latency_counts_from_the_time_an_act_was_due() {
+        let (tally, now) = (tally(), Instant::now());
+        tally.record(now - 2 * SECOND, now - SECOND, &Ok(ActResponse::default()));
+        let counts = tally.counts();
+        assert!((counts.latency.max_ms(), counts.waited.max_ms()) > (2000.0, 1000.0));
+        assert!(counts.latency.max_ms() < 3000.0 && counts.waited.max_ms() < 1001.0);
+    }
+
+    #[test]
+    fn the_warm_up_counts_only_what_it_leaves_to_answer() {
+        let (tally, now) = (tally(), Instant::now());
+        tally.record(tally.window.start, now, &Ok(ActResponse { evaluations: 3, ..ActResponse::default() }));
+        tally.record(tally.window.start, now, &Err(Failure::new("QUEUE_FULL")));
+        tally.record(now, now, &Err(Failure::new("QUEUE_FULL")));
+        let counts = tally.counts();
+        assert_eq!((counts.answered, counts.evaluations, counts.latency.count()), (1, 3, 0));
+        assert_eq!(counts.errors, BTreeMap::from([("QUEUE_FULL".to_owned(), 1)]));
+    }
+
+    #[test]
+    fn what_was_never_sent_has_waited_until_the_end() {
+        let tally = tally();
+        tally.give_up(tally.window.end - 10 * SECOND);
+        tally.give_up(tally.window.start);
+        let counts = tally.counts();
+        assert_eq!((counts.unsent, counts.latency.count(), counts.latency.max_ms()), (1, 1, 10_000.0));
+    }
+}
