@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import signal
 import statistics
 import subprocess
@@ -54,6 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     # A termination unwinds as Ctrl-C does, so that no server is left behind.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    # torch.compile by the process itself: workers that outlive it would be taken for others at work.
+    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
     cores = machine.pin(arguments.cores)
     facts = machine.describe(cores)
     _say(f"{facts['processor']}, cores {facts['cores']}, PyTorch {facts['torch']}")

@@ -40,7 +40,7 @@ def run(*command: object) -> list[dict[str, Any]]:
     except subprocess.TimeoutExpired:
         raise NotMeasured(f"{_short(words[0])} took longer than {PATIENCE:.0f} s") from None
     if done.returncode != 0:
-        raise NotMeasured(f"`{' '.join([_short(words[0]), *words[1:]])}` failed: {_last_line(done.stderr)}")
+        raise NotMeasured(f"`{' '.join([_short(words[0]), *words[1:]])}` failed: {_complaint(done.stderr)}")
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
 
 
@@ -65,7 +65,7 @@ def _running(words: Sequence[str], ready: str) -> Iterator[subprocess.Popen[byte
             while not _answers(ready):
                 if process.poll() is not None or time.monotonic() > deadline:
                     log.seek(0)
-                    raise NotMeasured(f"{_short(words[0])} did not become ready: {_last_line(log.read().decode(errors='replace'))}")
+                    raise NotMeasured(f"{_short(words[0])} did not become ready: {_complaint(log.read().decode(errors='replace'))}")
                 time.sleep(0.05)
             yield process
         finally:
@@ -141,6 +141,8 @@ def _short(path: str) -> str:
     return str(Path(path).relative_to(ROOT)) if Path(path).is_relative_to(ROOT) else Path(path).name
 
 
-def _last_line(text: str) -> str:
-    lines = [line for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else "no word"
+def _complaint(text: str) -> str:
+    """What a program said last, or the line that it calls an error."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    named = [line for line in lines if line.lower().startswith("error")]
+    return (named or lines[-1:] or ["no word"])[0]
