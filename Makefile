@@ -9,7 +9,7 @@ ENV ?= cheetah-wind-s
 EPISODES ?= 300
 DEMO_EPISODES ?= 32
 
-.PHONY: help demo serve collect train test test-rust test-python lint bench docs proto-python tools clean
+.PHONY: help demo serve collect train test test-rust test-python lint load bench docs proto-python tools clean
 
 help: ## This list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 24
@@ -41,11 +41,27 @@ lint: venv ## Formatting, clippy, docs and ruff, all with warnings as errors.
 	cargo fmt --check
 	cargo clippy $(CARGO_FLAGS) --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc $(CARGO_FLAGS) --no-deps
-	$(BIN)/ruff check clients/python tests
-	$(BIN)/ruff format --check clients/python tests
+	$(BIN)/ruff check clients/python tests benches
+	$(BIN)/ruff format --check clients/python tests benches
+
+load: ## Puts load on the server of `make serve`: make load LOAD="--clients 32 --seconds 10"; LOAD=--help tells more.
+	cargo run $(CARGO_FLAGS) --quiet --example load -- $(LOAD)
 
 bench: ## Kernel, forward, act and training-step times of this machine.
 	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 cargo bench --locked
+
+# PEERS_VENV may name a virtual environment that has the requirements already.
+PEERS_VENV ?= .venv-peers
+PEERS ?=
+.PHONY: bench-peers
+bench-peers: tools $(if $(filter .venv-peers,$(PEERS_VENV)),.venv-peers/.ready) ## Ratios to PyTorch and a Python policy server (downloads PyTorch, half an hour); PEERS=--help tells more.
+	cargo build $(CARGO_FLAGS) --bins --examples
+	$(PEERS_VENV)/bin/python benches/peers/compare.py $(PEERS)
+
+.venv-peers/.ready: benches/peers/requirements.txt
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/pip install --quiet --disable-pip-version-check -r $<
+	touch $@
 
 proto-python: tools ## Writes the Python stubs anew from proto/, with the lowest version that clients may have.
 	$(PYTHON) -m venv target/proto-venv
@@ -68,4 +84,4 @@ $(VENV)/.ready: clients/python/requirements.lock clients/python/pyproject.toml |
 	touch $@
 
 clean: ## Removes what was built.
-	rm -rf target $(VENV) out
+	rm -rf target $(VENV) .venv-peers out

@@ -2,15 +2,10 @@
 //!
 //!     cargo run --release --example make_tiny
 
-use ada_diffuser::model::{
-    Networks,
-    checkpoint::{self, Provenance},
-    config::ModelConfig,
-    denoiser::DenoiserConfig,
-    latent::LatentConfig,
-    nn::params::Params,
-    trajectory::Layout,
-};
+#[path = "shared/random_weights.rs"]
+mod random_weights;
+
+use ada_diffuser::model::{config::ModelConfig, denoiser::DenoiserConfig, latent::LatentConfig, trajectory::Layout};
 use std::path::Path;
 
 const SEED: u64 = 7;
@@ -20,11 +15,7 @@ fn main() -> anyhow::Result<()> {
     let (latent, denoiser) = (LatentConfig { dim: 6, hidden: 32 }, DenoiserConfig::Unet { widths: vec![8, 16, 16] });
     let plain = ModelConfig::plain(layout, Some(latent), denoiser);
     let config = ModelConfig { state_clip: 10.0, sub_steps_trained: vec![2, 3, 5], ..plain };
-    let params = Params::fresh(SEED);
-    Networks::new(&config, &params)?;
-    let tensors = params.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
-    let provenance = Provenance { dataset: "none: random weights".into(), seed: SEED, ..Provenance::default() };
-    checkpoint::save(Path::new("models/tiny"), &config, &tensors, &provenance)?;
+    random_weights::save(Path::new("models/tiny"), &config, SEED)?;
     println!("wrote models/tiny");
     Ok(())
 }

@@ -3,6 +3,7 @@
 mod bytes;
 mod engine;
 mod errors;
+mod generator;
 mod lifecycle;
 mod limits;
 mod steps;

@@ -1,0 +1,104 @@
+//! Writes a checkpoint with seeded random weights, of any size: to measure a server with, not to act with.
+//!
+//!     cargo run --release --example make_random -- --out out/models/wide --widths 32,64,128,256
+//!     cargo run --release --example make_random -- --out out/models/dit --net dit --width 256 --depth 2 --heads 8
+
+#[path = "shared/random_weights.rs"]
+mod random_weights;
+
+use ada_diffuser::model::{
+    agent::SamplerOptions,
+    checkpoint,
+    config::{ModelConfig, Restart},
+    denoiser::DenoiserConfig,
+    latent::LatentConfig,
+    trajectory::Layout,
+};
+use clap::{Parser, ValueEnum};
+use std::path::PathBuf;
+
+/// Writes a checkpoint with seeded random weights. The default sizes are HalfCheetah's with the narrow U-Net.
+///
+/// Its sessions stream, and no jump of state or latent starts a window anew: so an act costs one network evaluation from the second on,
+/// whatever is observed. Put the directory among a server's models (`ada-server --models out/models`).
+#[derive(Parser)]
+struct Flags {
+    /// Directory of the checkpoint; its name is the model's.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Backbone of the denoiser.
+    #[arg(long, value_enum, default_value_t = Net::Unet)]
+    net: Net,
+    /// U-Net: channels of each depth; the horizon must be divisible by 2^(depths - 1).
+    #[arg(long, value_delimiter = ',', default_value = "32,64,64,64", value_name = "N,N,..")]
+    widths: Vec<usize>,
+    /// DiT: width of a token.
+    #[arg(long, default_value_t = 256)]
+    width: usize,
+    /// DiT: number of blocks.
+    #[arg(long, default_value_t = 2)]
+    depth: usize,
+    /// DiT: attention heads.
+    #[arg(long, default_value_t = 8)]
+    heads: usize,
+    /// Values of a state.
+    #[arg(long, default_value_t = 17)]
+    state_dim: usize,
+    /// Values of an action.
+    #[arg(long, default_value_t = 6)]
+    action_dim: usize,
+    /// Positions that the planner generates (T).
+    #[arg(long, default_value_t = 16)]
+    plan_horizon: usize,
+    /// Real steps that the latent looks back on (T_x).
+    #[arg(long, default_value_t = 10)]
+    block_len: usize,
+    /// Width of the latent; 0: a model without latents.
+    #[arg(long, default_value_t = 20)]
+    latent_dim: usize,
+    /// Hidden size of the latent's GRU.
+    #[arg(long, default_value_t = 64)]
+    hidden: usize,
+    /// Number of diffusion levels (K).
+    #[arg(long, default_value_t = 150)]
+    level_max: usize,
+    /// Seed of the weights.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Net {
+    /// Temporal U-Net.
+    Unet,
+    /// Diffusion transformer.
+    Dit,
+}
+
+impl Flags {
+    fn config(&self) -> ModelConfig {
+        let denoiser = match self.net {
+            Net::Unet => DenoiserConfig::Unet { widths: self.widths.clone() },
+            Net::Dit => DenoiserConfig::Dit { width: self.width, depth: self.depth, heads: self.heads },
+        };
+        let latent = (self.latent_dim > 0).then_some(LatentConfig { dim: self.latent_dim, hidden: self.hidden });
+        let layout = Layout { state_dim: self.state_dim, action_dim: self.action_dim };
+        ModelConfig {
+            plan_horizon: self.plan_horizon,
+            block_len: self.block_len,
+            level_max: self.level_max,
+            // Finite, since JSON has no infinity, and out of reach.
+            restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: 1e30 },
+            sampler: SamplerOptions { temperature: 0.0, ..SamplerOptions::default() },
+            ..ModelConfig::plain(layout, latent, denoiser)
+        }
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let flags = Flags::parse();
+    random_weights::save(&flags.out, &flags.config(), flags.seed)?;
+    checkpoint::load(&flags.out)?;
+    println!("wrote {}", flags.out.display());
+    Ok(())
+}
