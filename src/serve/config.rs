@@ -114,6 +114,11 @@ pub struct EngineConfig {
     pub queue_len_max: usize,
     /// Acts that share one network evaluation of a worker.
     pub batch_len_max: usize,
+    /// Whether an act whose client named a deadline takes larger jumps, or gives out the current window, when it would come too late
+    /// otherwise; its answer is marked `degraded`.
+    pub anytime: bool,
+    /// Time kept for commit and answer of such an act.
+    pub deadline_margin_ms: u64,
     /// What a refused client is told to wait.
     pub retry_after_ms: u64,
     /// A worker silent for longer makes `/livez` fail.
@@ -208,7 +213,15 @@ impl Default for SessionsConfig {
 
 impl Default for EngineConfig {
     fn default() -> Self {
-        Self { workers: 0, queue_len_max: 1024, batch_len_max: 32, retry_after_ms: 100, heartbeat_age_ms_max: 10_000 }
+        Self {
+            workers: 0,
+            queue_len_max: 1024,
+            batch_len_max: 32,
+            anytime: true,
+            deadline_margin_ms: 1,
+            retry_after_ms: 100,
+            heartbeat_age_ms_max: 10_000,
+        }
     }
 }
 

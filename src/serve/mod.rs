@@ -120,10 +120,11 @@ impl Server {
     }
 }
 
-async fn load(service: &Service, config: Config) -> Result<(), ServerError> {
-    let loaded = tokio::task::spawn_blocking(move || Registry::load(&config.models)).await;
-    let registry = loaded.map_err(|panic| ServerError::Engine(io::Error::other(panic)))??;
-    service.set_registry(registry);
+async fn load(service: &Arc<Service>, config: Config) -> Result<(), ServerError> {
+    let warm = service.clone();
+    let loading = move || Registry::load(&config.models).inspect(|registry| warm.warm_up(registry));
+    let loaded = tokio::task::spawn_blocking(loading).await;
+    service.set_registry(loaded.map_err(|panic| ServerError::Engine(io::Error::other(panic)))??);
     Ok(())
 }
 

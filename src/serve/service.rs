@@ -3,8 +3,8 @@
 use crate::{
     model::agent::Episode,
     serve::{
-        config::Config,
-        engine::{Engine, Job, Question, Refusal},
+        config::{Config, EngineConfig},
+        engine::{Engine, EngineOptions, Job, Question, Refusal},
         error::{Part, ServiceError, Stage},
         registry::{Model, Registry},
         request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page},
@@ -41,9 +41,22 @@ impl Service {
     /// # Errors
     /// If the system gives no threads for the engine.
     pub fn start(config: Config) -> std::io::Result<Self> {
-        let engine = Engine::start(config.engine.workers, config.engine.queue_len_max, config.engine.batch_len_max)?;
+        let EngineConfig { workers, queue_len_max, batch_len_max, deadline_margin_ms, .. } = config.engine;
+        let deadline_margin = Duration::from_millis(deadline_margin_ms);
+        let engine = Engine::start(EngineOptions { workers, queue_len_max, batch_len_max, deadline_margin })?;
         let sessions = Sessions::new(config.sessions.clone());
         Ok(Self { config, registry: OnceLock::new(), sessions, engine, draining: CancellationToken::new() })
+    }
+
+    /// Runs each model in every batch length, so that its first act is as fast as any. Blocks for that time.
+    pub fn warm_up(&self, registry: &Registry) {
+        for model in registry.list() {
+            let begin = Instant::now();
+            match self.engine.warm_up(&model.agent) {
+                Ok(()) => tracing::info!(model = %model.name, ms = begin.elapsed().as_millis() as u64, "warmed up"),
+                Err(failure) => tracing::error!(model = %model.name, ?failure, "warm-up failed; its acts will say why"),
+            }
+        }
     }
 
     /// Gives it its models, once; from then on it is ready.
@@ -234,7 +247,8 @@ impl Service {
         let ActRequest { step, observation, deadline, want_planned_states, .. } = request;
         let limits = &self.config.limits;
         let longest = Duration::from_millis(limits.act_deadline_ms_max);
-        let patience = deadline.unwrap_or(Duration::from_millis(limits.act_deadline_ms)).min(longest);
+        let usual = Duration::from_millis(limits.act_deadline_ms);
+        let patience = deadline.unwrap_or(usual).min(longest);
         if patience.is_zero() {
             return Err(ServiceError::Deadline { stage: Stage::Admission });
         }
@@ -249,7 +263,10 @@ impl Service {
                 (waiter, true)
             }
             Entry::Lead(waiter, episode) => {
-                self.submit(Seat { session: session.clone(), flight: waiter.flight().clone() }, Question { episode, observation });
+                // Whoever is more patient than usual does not wait longer than usual for a turn.
+                let due = deadline.filter(|_| self.config.engine.anytime).map(|_| arrived + patience);
+                let urgency = Urgency { turn_by: arrived + patience.min(usual), due };
+                self.submit(Seat { session: session.clone(), flight: waiter.flight().clone() }, Question { episode, observation }, urgency);
                 (waiter, false)
             }
         };
@@ -257,13 +274,13 @@ impl Service {
     }
 
     /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
-    fn submit(&self, seat: Seat, question: Question) {
+    fn submit(&self, seat: Seat, question: Question, Urgency { turn_by, due }: Urgency) {
         let agent = seat.session.agent.clone();
         let descent = match question.begin(&agent) {
             Ok(descent) => descent,
             Err(error) => return seat.session.fail(&seat.flight, ServiceError::from_agent(error)),
         };
-        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now() };
+        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now(), turn_by, due };
         let Err((refusal, job)) = self.engine.submit(job) else { return };
         let error = match refusal {
             Refusal::Full => {
@@ -295,6 +312,12 @@ impl Service {
         }
         Ok(Duration::from_millis(ttl_ms))
     }
+}
+
+/// What the engine knows of an act's deadline; see [`Job`].
+struct Urgency {
+    turn_by: Instant,
+    due: Option<Instant>,
 }
 
 async fn wait(waiter: &Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {

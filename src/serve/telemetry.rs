@@ -28,7 +28,7 @@ pub enum Kind {
 use Kind::{Counter, Gauge, Histogram};
 
 /// Every metric: name, kind, meaning.
-pub const CATALOGUE: [(&str, Kind, &str); 31] = [
+pub const CATALOGUE: [(&str, Kind, &str); 32] = [
     ("ada_build_info", Gauge, "1, labelled by version"),
     ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
     ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
@@ -48,6 +48,7 @@ pub const CATALOGUE: [(&str, Kind, &str); 31] = [
     ("ada_wasted_network_evaluations_total", Counter, "evaluations of acts that were dropped"),
     ("ada_batch_size", Histogram, "acts that share one network evaluation"),
     ("ada_batches_total", Counter, "network evaluations of whole batches"),
+    ("ada_degraded_total", Counter, "acts that a deadline cut short"),
     ("ada_queue_depth", Gauge, "acts that wait for a worker"),
     ("ada_inflight_acts", Gauge, "acts in the batches of the workers"),
     ("ada_shed_total", Counter, "requests refused because a bound was reached, by reason"),

@@ -275,3 +275,54 @@ fn rows_hold_the_real_state_and_refine_once_an_action() {
     }
     assert_eq!((refined, emitted), (3, 3));
 }
+
+/// An allowance is kept, over cold starts and chunks, with the same rows of the ladder; one that is large enough changes nothing.
+#[test]
+fn an_allowance_makes_larger_jumps() {
+    let agent = agent(true, 1, unet());
+    for (allowance, action_horizon, sub_steps) in [(1, 1, 1), (3, 1, 1), (5, 1, 3), (4, 3, 2), (7, 3, 1), (9, 2, 1), (100, 3, 2)] {
+        let options = SamplerOptions { action_horizon, sub_steps, ..options() };
+        let (episode, observation) = (agent.open(1, &options).unwrap(), observation(&mut Philox::new(1)));
+        let mut descents = [agent.begin(&episode, &observation).unwrap()];
+        descents[0].allow(Some(allowance));
+        while !descents[0].is_done() {
+            agent.advance(&mut descents).unwrap();
+        }
+        let [descent] = descents;
+        let (next, chunk) = agent.finish(descent).unwrap();
+        let whole = agent.act(&episode, &observation).unwrap();
+        assert_eq!(chunk.actions.len(), action_horizon);
+        // Each action of a chunk takes at least one evaluation.
+        assert!(chunk.evaluations as usize <= allowance.max(action_horizon), "{} of {allowance}", chunk.evaluations);
+        assert_eq!(chunk.degraded, (whole.1.evaluations as usize) > allowance);
+        if !chunk.degraded {
+            assert_eq!((next, chunk), whole);
+        }
+    }
+}
+
+/// Without time for an evaluation, the window of the act before gives its next action as it stands, and the act after goes on from it,
+/// one rung higher; what has nothing to give says so.
+#[test]
+fn cut_short_gives_the_window_as_it_is() {
+    let agent = agent(true, 1, unet());
+    let mut stream = Philox::new(7);
+    let mut see = || observation(&mut stream);
+    let fresh = agent.open(1, &options()).unwrap();
+    let mut first = agent.begin(&fresh, &see()).unwrap();
+    assert!(!agent.cut_short(&mut first) && !first.is_done(), "a cold start has nothing yet");
+    let (episode, _) = agent.act(&fresh, &see()).unwrap();
+    let stored = episode.window.as_ref().unwrap().x.clone();
+    let mut second = agent.begin(&episode, &see()).unwrap();
+    assert!(agent.cut_short(&mut second) && second.is_done());
+    let (episode, chunk) = agent.finish(second).unwrap();
+    assert_eq!((chunk.degraded, chunk.evaluations), (true, 0));
+    assert_eq!(chunk.actions[0], agent.config.normalizer.action.denormalize(&stored[3..5]));
+    let window = episode.window.as_ref().unwrap();
+    assert_eq!((window.row, &window.x[..(HORIZON - 1) * 5]), (HORIZON - 2, &stored[5..]));
+    let (_, third) = agent.act(&episode, &see()).unwrap();
+    assert_eq!((third.degraded, third.evaluations, third.start), (false, 2, Start::Warm));
+    let mut cold = [agent.begin(&fresh, &see()).unwrap()];
+    agent.advance(&mut cold).unwrap();
+    assert!(agent.cut_short(&mut cold[0]) && cold[0].is_done(), "after an evaluation there is an estimate");
+}

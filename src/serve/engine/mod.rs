@@ -1,8 +1,11 @@
 //! The engine: threads of its own that run many acts at once, one network evaluation at a time.
 //!
-//! An act waits in the bounded `queue`; a `worker` takes it into its batch; each `tick` is one evaluation shared by all acts of the batch. Acts join
-//! and leave between ticks, so nobody waits for another's ladder to end. The engine knows neither sessions nor clients: it gives each outcome to a ticket.
+//! An act waits in the bounded `queue`, the earliest deadline first; a `worker` takes it into its batch; each `tick` is one evaluation shared by all
+//! acts of the batch, whatever rung each stands on. Acts join and leave between ticks, so nobody waits for another's ladder to end. An act whose
+//! client named a deadline takes larger jumps when the `cost` of ticks says that it would come too late. The engine knows neither sessions nor
+//! clients: it gives each outcome to a ticket.
 
+mod cost;
 mod queue;
 mod tick;
 mod worker;
@@ -14,6 +17,7 @@ use std::{
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
+        mpsc,
     },
     thread::JoinHandle,
     time::{Duration, Instant},
@@ -61,6 +65,10 @@ pub struct Job<T> {
     pub ticket: T,
     /// When it was submitted.
     pub submitted: Instant,
+    /// When it should have had its turn: the queue's order.
+    pub turn_by: Instant,
+    /// When its answer is late, if a coarser one in time is better than none: the act may be degraded.
+    pub due: Option<Instant>,
 }
 
 /// An act computed.
@@ -95,25 +103,67 @@ pub struct Engine<T: Ticket> {
     threads: Mutex<Vec<JoinHandle<()>>>,
 }
 
+/// Sizes of an engine.
+#[derive(Clone, Copy, Debug)]
+pub struct EngineOptions {
+    /// Threads.
+    pub workers: usize,
+    /// Acts that wait.
+    pub queue_len_max: usize,
+    /// Acts of a batch.
+    pub batch_len_max: usize,
+    /// Time kept for what follows the last evaluation of an act in a hurry: commit and answer.
+    pub deadline_margin: Duration,
+}
+
+/// A model to get ready for, and whom to tell.
+type WarmUp = (Arc<Agent>, mpsc::Sender<Result<(), Failure>>);
+
 /// What workers and callers share.
 struct Shared<T> {
     queue: Queue<Box<Job<T>>>,
-    batch_len_max: usize,
+    options: EngineOptions,
+    /// For each worker; None after the end.
+    warm_ups: Vec<Mutex<Option<Vec<WarmUp>>>>,
     epoch: Instant,
     /// When each worker was last seen, in ms since `epoch`.
     heartbeats: Vec<AtomicU64>,
 }
 
 impl<T: Ticket> Engine<T> {
-    /// Starts `workers` threads.
+    /// Starts the threads.
     ///
     /// # Errors
     /// If the system gives no more threads.
-    pub fn start(workers: usize, queue_len_max: usize, batch_len_max: usize) -> std::io::Result<Self> {
-        let heartbeats = (0..workers).map(|_| AtomicU64::new(0)).collect();
-        let shared = Arc::new(Shared { queue: Queue::new(queue_len_max, workers), batch_len_max, epoch: Instant::now(), heartbeats });
+    pub fn start(options: EngineOptions) -> std::io::Result<Self> {
+        let workers = options.workers;
+        let shared = Arc::new(Shared {
+            queue: Queue::new(options.queue_len_max, workers),
+            options,
+            warm_ups: (0..workers).map(|_| Mutex::new(Some(Vec::new()))).collect(),
+            epoch: Instant::now(),
+            heartbeats: (0..workers).map(|_| AtomicU64::new(0)).collect(),
+        });
         let threads = (0..workers).map(|index| worker::spawn(shared.clone(), index)).collect::<Result<_, _>>()?;
         Ok(Self { shared, threads: Mutex::new(threads) })
+    }
+
+    /// Runs ticks of every batch length on every worker, so that the first acts find memory and code in place, and measures them. Waits
+    /// until all are done; to be called before the model's first act.
+    ///
+    /// # Errors
+    /// If the model fails, or the engine ends meanwhile.
+    pub fn warm_up(&self, agent: &Arc<Agent>) -> Result<(), Failure> {
+        let (done, outcomes) = mpsc::channel();
+        for mailbox in &self.shared.warm_ups {
+            mailbox.lock().as_mut().ok_or(Failure::Stopped)?.push((agent.clone(), done.clone()));
+        }
+        drop(done);
+        self.shared.queue.wake();
+        for _ in &self.shared.warm_ups {
+            outcomes.recv().unwrap_or(Err(Failure::Stopped))?;
+        }
+        Ok(())
     }
 
     /// Puts an act into the queue.
@@ -121,7 +171,8 @@ impl<T: Ticket> Engine<T> {
     /// # Errors
     /// If the queue is full or the engine has ended; the job comes back.
     pub fn submit(&self, job: Job<T>) -> Result<(), (Refusal, Box<Job<T>>)> {
-        self.shared.queue.push(Box::new(job), |waiting| waiting.ticket.is_wanted())
+        let turn_by = job.turn_by;
+        self.shared.queue.push(Box::new(job), turn_by, |waiting| waiting.ticket.is_wanted())
     }
 
     /// Acts that wait, and acts in batches.
@@ -140,6 +191,7 @@ impl<T: Ticket> Engine<T> {
         for job in self.shared.queue.close() {
             job.ticket.settle(Err(Failure::Stopped));
         }
+        self.shared.warm_ups.iter().for_each(|mailbox| *mailbox.lock() = None);
         let end = Instant::now() + patience;
         for thread in std::mem::take(&mut *self.threads.lock()) {
             while !thread.is_finished() && Instant::now() < end {

@@ -1,6 +1,6 @@
-//! One inference thread: take what arrived, tick, show a sign of life.
+//! One inference thread: get ready for new models, take what arrived, tick, show a sign of life.
 
-use super::{Failure, Shared, Ticket, tick::Batch};
+use super::{Shared, Ticket, tick::Batch};
 use std::{
     io,
     sync::Arc,
@@ -14,12 +14,18 @@ pub(super) fn spawn<T: Ticket>(shared: Arc<Shared<T>>, index: usize) -> io::Resu
 }
 
 fn run<T: Ticket>(shared: &Shared<T>, index: usize) {
-    let mut batch = Batch::default();
+    let mut batch = Batch::new(shared.options);
     let mut ended = 0;
     loop {
         shared.beat(index);
+        let asked = shared.warm_ups[index].lock().as_mut().map(std::mem::take).unwrap_or_default();
+        for (agent, done) in asked {
+            // Whoever asked may have gone meanwhile.
+            let _gone = done.send(batch.warm_up(&agent));
+            shared.beat(index);
+        }
         let held = batch.len();
-        let Some(arrivals) = shared.queue.take(held, ended, shared.batch_len_max.saturating_sub(held)) else { break };
+        let Some(arrivals) = shared.queue.take(held, ended, shared.options.batch_len_max.saturating_sub(held)) else { break };
         let before = held + arrivals.len();
         for job in arrivals {
             batch.admit(*job);
@@ -27,7 +33,5 @@ fn run<T: Ticket>(shared: &Shared<T>, index: usize) {
         batch.tick();
         ended = before - batch.len();
     }
-    for ticket in batch.into_tickets() {
-        ticket.settle(Err(Failure::Stopped));
-    }
+    batch.stop();
 }

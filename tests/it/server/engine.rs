@@ -7,7 +7,7 @@ use ada_diffuser::{
         checkpoint,
         normalizer::Affine,
     },
-    serve::engine::{Engine, Failure, Finished, Job, Question, Refusal, Ticket},
+    serve::engine::{Engine, EngineOptions, Failure, Finished, Job, Question, Refusal, Ticket},
 };
 use std::{
     path::Path,
@@ -62,7 +62,12 @@ fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Recei
     let descent = question.begin(asked).unwrap();
     let (outcome, receiver) = mpsc::channel();
     let ticket = Seat { outcome, gate: None };
-    (Job { agent: run_on.clone(), question, descent, ticket, submitted: Instant::now() }, receiver)
+    let now = Instant::now();
+    (Job { agent: run_on.clone(), question, descent, ticket, submitted: now, turn_by: now, due: None }, receiver)
+}
+
+fn one_worker(batch_len_max: usize) -> Engine<Seat> {
+    Engine::start(EngineOptions { workers: 1, queue_len_max: 64, batch_len_max, deadline_margin: Duration::ZERO }).unwrap()
 }
 
 /// An act of another model makes the shared forward fail; its batch mates are answered as if it had not been there.
@@ -70,7 +75,7 @@ fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Recei
 fn a_poisoned_act_fails_alone() {
     let dir = tempfile::tempdir().unwrap();
     let (tiny, narrow) = (agent("tiny"), narrow(dir.path()));
-    let engine = Engine::start(1, 64, 64).unwrap();
+    let engine = one_worker(64);
     let (open_gate, gate) = mpsc::channel();
     let mut gate = Some(gate);
     let (mut outcomes, mut expected) = (Vec::new(), Vec::new());
@@ -95,7 +100,7 @@ fn a_poisoned_act_fails_alone() {
 #[test]
 fn the_end_fails_what_is_left_and_refuses_what_comes() {
     let slow = agent("slow");
-    let engine = Engine::start(1, 64, 1).unwrap();
+    let engine = one_worker(1);
     let (first, running) = job(&slow, &slow, 1);
     let (second, waiting) = job(&slow, &slow, 2);
     assert!(engine.submit(first).is_ok() && engine.submit(second).is_ok());
@@ -110,4 +115,38 @@ fn the_end_fails_what_is_left_and_refuses_what_comes() {
     }
     let (late, _outcome) = job(&slow, &slow, 3);
     assert!(matches!(engine.submit(late), Err((Refusal::Closed, _))));
+}
+
+/// An act in a hurry takes what its time allows, and says so; one with time enough is as if it had no deadline.
+#[test]
+fn a_deadline_makes_larger_jumps() {
+    let (slow, tiny) = (agent("slow"), agent("tiny"));
+    let engine = one_worker(8);
+    engine.warm_up(&slow).unwrap();
+    engine.warm_up(&tiny).unwrap();
+    let (mut hasty, outcome) = job(&slow, &slow, 1);
+    hasty.due = Some(Instant::now() + Duration::from_millis(400));
+    assert!(engine.submit(hasty).is_ok());
+    let finished = outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap();
+    assert!(finished.chunk.degraded && finished.chunk.evaluations > 20, "{:?}", finished.chunk.evaluations);
+    assert!(finished.compute < Duration::from_secs(5));
+    let (mut late, outcome) = job(&slow, &slow, 1);
+    late.due = Some(Instant::now());
+    assert!(engine.submit(late).is_ok());
+    let finished = outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap();
+    assert_eq!((finished.chunk.degraded, finished.chunk.evaluations), (true, 1), "nothing to give out before the first evaluation");
+    let (mut calm, outcome) = job(&tiny, &tiny, 3);
+    calm.due = Some(Instant::now() + Duration::from_secs(3600));
+    let expected = tiny.act(&calm.question.episode, &calm.question.observation).unwrap().1;
+    assert!(engine.submit(calm).is_ok());
+    assert_eq!(outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap().chunk, expected);
+}
+
+/// A model that nobody warmed up is served all the same; only, its acts are never hurried.
+#[test]
+fn an_ended_engine_does_not_warm_up() {
+    let engine = one_worker(2);
+    engine.stop(Duration::from_secs(5));
+    let tiny = agent("tiny");
+    assert!(matches!(engine.warm_up(&tiny), Err(Failure::Stopped)));
 }

@@ -221,7 +221,7 @@ async fn messages_that_are_too_large_or_none() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_full_queue_and_passed_deadlines() {
-    let (_process, server) = start_process(&["engine.workers=1", "engine.queue_len_max=1"]).await;
+    let (_process, server) = start_process(&["engine.workers=1", "engine.queue_len_max=1", "engine.anytime=false"]).await;
     let (running, waiting, third) =
         (server.open(json!({"model": "slow"})).await, server.open(json!({})).await, server.open(json!({})).await);
     let hasty = |id: &str, ms| pb::ActRequest { deadline_ms: Some(ms), ..act(id, 1, &STATE) };
@@ -248,7 +248,8 @@ async fn a_full_queue_and_passed_deadlines() {
 /// The call's own timeout counts like `deadline_ms`. (Without a socket: a stock client would end the call by itself at the same moment.)
 #[tokio::test(flavor = "multi_thread")]
 async fn the_timeout_of_a_grpc_call() {
-    let config = config().validated().unwrap();
+    let mut config = config().validated().unwrap();
+    config.engine.anytime = false;
     let registry = Registry::load(&config.models).unwrap();
     let service = Arc::new(Service::start(config).unwrap());
     service.set_registry(registry);
@@ -262,6 +263,25 @@ async fn the_timeout_of_a_grpc_call() {
         let late = timeout(Duration::from_secs(10), agent.act(request)).await.expect("it was not heard").unwrap_err();
         assert_eq!(failure(&late), (Code::DeadlineExceeded, "DEADLINE_COMPUTE".into()));
     }
+}
+
+/// Rather than nothing, an act with a deadline gets a coarser answer in time, which says so and is repeated like any other.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_deadline_gets_a_degraded_answer() {
+    let server = start(|_| {}).await;
+    let body = json!({"step": 1, "observation": {"state": STATE}, "deadline_ms": 500});
+    let id = server.open(json!({"model": "slow"})).await;
+    let answer = server.post(&format!("/v1/sessions/{id}/act"), &body).await;
+    assert_eq!((answer.status, answer.json()["degraded"].as_bool()), (200, Some(true)));
+    let again = server.post(&format!("/v1/sessions/{id}/act"), &body).await.json();
+    assert_eq!((&again["actions"], &again["degraded"], &again["replayed"]), (&answer.json()["actions"], &json!(true), &json!(true)));
+    assert!(server.metric("ada_degraded_total").await >= 1.0);
+    let id = server.open(json!({"model": "slow"})).await;
+    let grpc = server.agent().await.act(pb::ActRequest { deadline_ms: Some(500), ..act(&id, 1, &STATE) }).await.unwrap().into_inner();
+    assert!(grpc.degraded && grpc.evaluations > 1);
+    let id = server.open(json!({"model": "tiny"})).await;
+    let grpc = server.agent().await.act(pb::ActRequest { deadline_ms: Some(20_000), ..act(&id, 1, &STATE) }).await.unwrap().into_inner();
+    assert!(!grpc.degraded);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -69,7 +69,7 @@ async fn a_drain_ends_in_bounded_time_whatever_the_clients_do() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_act_in_flight_survives_a_drain() {
-    let mut server = start(|_| {}).await;
+    let mut server = start(|config| config.engine.anytime = false).await;
     let id = server.open(json!({"model": "slow"})).await;
     let mut agent = server.agent().await;
     let request = pb::ActRequest { deadline_ms: Some(800), ..act(&id, 1, &STATE) };
