@@ -9,12 +9,12 @@ use ada_diffuser::model::{
     config::ModelConfig,
     denoiser::{Condition, Denoiser, DenoiserConfig},
     latent::LatentConfig,
-    nn::{Buffer, Params, Value},
+    nn::{Activation, Buffer, GroupNormMish, Gru, LayerNorm, Params, Value, conv1d::ConvLayer},
     noise::Philox,
     trajectory::Layout,
 };
 use ada_diffuser::train::{optimizer::Adam, parallel::side_by_side};
-use candle_core::{Tensor, backprop::GradStore};
+use candle_core::{Result, Tensor, backprop::GradStore};
 use clap::{Parser, ValueEnum};
 use std::{sync::Barrier, time::Instant};
 
@@ -65,6 +65,8 @@ enum Net {
 enum What {
     /// One evaluation of all windows.
     Forward,
+    /// The bare matrix products of an evaluation, without all that stands between them.
+    Bound,
     /// One training step: mean square error, its gradient, Adam.
     Train,
 }
@@ -73,10 +75,15 @@ fn main() -> anyhow::Result<()> {
     let flags = Flags::parse();
     let config = config(&flags);
     let ms = match flags.what {
-        What::Forward => forward(&flags, &config)?,
+        What::Forward => forward::<Buffer>(&flags, &config)?,
+        What::Bound => forward::<Bare>(&flags, &config)?,
         What::Train => train(&flags, &config)?,
     };
-    let what = if matches!(flags.what, What::Forward) { "forward" } else { "train" };
+    let what = match flags.what {
+        What::Forward => "forward",
+        What::Bound => "bound",
+        What::Train => "train",
+    };
     let net = if matches!(flags.net, Net::Unet) { "unet" } else { "dit" };
     let widths = flags.widths.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
     println!(
@@ -103,15 +110,15 @@ fn frozen(config: &ModelConfig) -> anyhow::Result<Networks> {
     Ok(Networks::new(config, &Params::loaded(tensors))?)
 }
 
-fn forward(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
+fn forward<V: Value>(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
     let networks = frozen(config)?;
     let shape = (flags.batch.div_ceil(flags.threads), flags.len);
-    let alone = median(rounds(&networks.denoiser, shape, &Barrier::new(1), 10)?);
+    let alone = median(rounds::<V>(&networks.denoiser, shape, &Barrier::new(1), 10)?);
     let (count, meet) = ((flags.seconds * 1e3 / alone) as usize + 10, Barrier::new(flags.threads));
     std::thread::scope(|scope| {
         let (net, meet) = (&networks.denoiser, &meet);
-        let others: Vec<_> = (1..flags.threads).map(|_| scope.spawn(move || rounds(net, shape, meet, count))).collect();
-        let times = rounds(net, shape, meet, count);
+        let others: Vec<_> = (1..flags.threads).map(|_| scope.spawn(move || rounds::<V>(net, shape, meet, count))).collect();
+        let times = rounds::<V>(net, shape, meet, count);
         for other in others {
             other.join().map_err(|_| anyhow::anyhow!("a thread ended by panic"))??;
         }
@@ -120,8 +127,8 @@ fn forward(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
 }
 
 /// Milliseconds of each round, from the moment all threads meet until each has evaluated its windows.
-fn rounds(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: usize) -> anyhow::Result<Vec<f64>> {
-    let (x, latents): (Buffer, Buffer) = (normals([batch, len, LAYOUT.dim()])?, normals([batch, len, LATENT])?);
+fn rounds<V: Value>(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: usize) -> anyhow::Result<Vec<f64>> {
+    let (x, latents): (V, V) = (normals([batch, len, LAYOUT.dim()])?, normals([batch, len, LATENT])?);
     let levels: Vec<f32> = (0..batch * len).map(|i| (i * 7 % LEVELS) as f32).collect();
     let round = |_| {
         meet.wait();
@@ -131,6 +138,84 @@ fn rounds(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: u
         Ok(begin.elapsed().as_secs_f64() * 1e3)
     };
     (0..count).map(round).collect()
+}
+
+/// A buffer on which only matrix products do any work.
+#[derive(Clone)]
+struct Bare(Buffer);
+
+impl Value for Bare {
+    fn generate(shape: [usize; 3], write: impl FnOnce(&mut [f32])) -> Result<Self> {
+        Buffer::generate(shape, write).map(Self)
+    }
+
+    fn shape(&self) -> Result<[usize; 3]> {
+        self.0.shape()
+    }
+
+    fn conv(&self, layer: &ConvLayer) -> Result<Self> {
+        self.0.conv(layer).map(Self)
+    }
+
+    fn gru(&self, layer: &Gru, before: Option<&Self>) -> Result<Self> {
+        self.0.gru(layer, before.map(|before| &before.0)).map(Self)
+    }
+
+    fn attention(&self, heads: usize) -> Result<Self> {
+        self.0.attention(heads).map(Self)
+    }
+
+    fn layer_norm(&self, _: &LayerNorm) -> Result<Self> {
+        Ok(self.clone())
+    }
+
+    fn group_norm_mish(self, _: &GroupNormMish) -> Result<Self> {
+        Ok(self)
+    }
+
+    fn activated(self, _: Activation) -> Result<Self> {
+        Ok(self)
+    }
+
+    fn plus(self, _: &Self) -> Result<Self> {
+        Ok(self)
+    }
+
+    fn plus_at_each_step(self, _: &Self) -> Result<Self> {
+        Ok(self)
+    }
+
+    fn modulated(self, _: &Self) -> Result<Self> {
+        Ok(self)
+    }
+
+    fn plus_gated(self, _: &Self, _: &Self) -> Result<Self> {
+        Ok(self)
+    }
+
+    fn beside(parts: &[&Self]) -> Result<Self> {
+        match parts {
+            [a, b] => Buffer::beside(&[&a.0, &b.0]).map(Self),
+            [a, b, c] => Buffer::beside(&[&a.0, &b.0, &c.0]).map(Self),
+            _ => candle_core::bail!("the denoiser puts two or three side by side"),
+        }
+    }
+
+    fn channels(&self, start: usize, len: usize) -> Result<Self> {
+        self.0.channels(start, len).map(Self)
+    }
+
+    fn step(&self, index: usize) -> Result<Self> {
+        self.0.step(index).map(Self)
+    }
+
+    fn or_absent(self, _: &Self, _: &Tensor) -> Result<Self> {
+        Ok(self)
+    }
+
+    fn clamped(self, _: f32, _: f32) -> Result<Self> {
+        Ok(self)
+    }
 }
 
 fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
