@@ -37,6 +37,22 @@ fn convolution(c: &mut Criterion) {
     group.finish();
 }
 
+/// The linear layers of the DiT, 256 to 1024 channels on 32 windows of 42 tokens.
+fn linear(c: &mut Criterion) {
+    let shape = ConvShape { c_in: 256, c_out: 1024, kernel: 1, stride: 1, padding: 0 };
+    let (weight, rows) = (values(256 * 1024), 32 * 42);
+    let (forward, back) = (shape.pack_gather(&weight), shape.pack_spread(&weight));
+    let plan = Convolution { shape, batch: 1, wide_steps: rows, narrow_steps: rows };
+    let (x, dy) = (values(rows * 256), values(rows * 1024));
+    let (mut y, mut dx) = (dy.clone(), x.clone());
+    let mut group = c.benchmark_group("linear");
+    group.throughput(Throughput::Elements(2 * (rows * 256 * 1024) as u64));
+    group.bench_function("forward", |b| b.iter(|| plan.gather(black_box(&x), &forward, None, &mut y)));
+    group.bench_function("input gradient", |b| b.iter(|| plan.spread(black_box(&dy), &back, None, &mut dx)));
+    group.bench_function("weight gradient", |b| b.iter(|| plan.weight_grad(black_box(&x), &dy)));
+    group.finish();
+}
+
 fn normalisation(c: &mut Criterion) {
     let mut group = c.benchmark_group("group norm and mish");
     let norm = Norm { steps: 8, channels: 64, groups: 8, eps: 1e-5, mish: true };
@@ -71,5 +87,5 @@ fn attention(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(kernels, convolution, normalisation, elementwise, attention);
+criterion_group!(kernels, convolution, linear, normalisation, elementwise, attention);
 criterion_main!(kernels);

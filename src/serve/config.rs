@@ -290,6 +290,8 @@ impl Config {
         range("sessions.ttl_ms", self.sessions.ttl_ms <= self.sessions.ttl_ms_max, "must be at most sessions.ttl_ms_max")?;
         range("limits.json_depth_max", self.limits.json_depth_max <= 128, "must be at most 128")?;
         let deadlines = self.limits.act_deadline_ms <= self.limits.act_deadline_ms_max;
+        let margin = self.engine.deadline_margin_ms < self.limits.act_deadline_ms;
+        range("engine.deadline_margin_ms", margin, "must be below limits.act_deadline_ms")?;
         range("limits.act_deadline_ms", deadlines, "must be at most limits.act_deadline_ms_max")?;
         Ok(self)
     }

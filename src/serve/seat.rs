@@ -26,6 +26,10 @@ impl Ticket for Seat {
         self.flight.start();
     }
 
+    fn due(&self) -> Option<Instant> {
+        self.flight.due()
+    }
+
     fn settle(self, outcome: Result<Finished, Failure>) {
         let Self { session, flight } = self;
         match outcome {

@@ -253,7 +253,8 @@ impl Service {
             return Err(ServiceError::Deadline { stage: Stage::Admission });
         }
         let acted = |answer, replayed| Acted { answer, replayed, want_planned_states };
-        let (waiter, replayed) = match session.enter(step, key_of(&observation), arrived)? {
+        let due = deadline.filter(|_| self.config.engine.anytime).map(|_| arrived + patience);
+        let (waiter, replayed) = match session.enter(step, key_of(&observation), arrived, due)? {
             Entry::Replay(answer) => {
                 metrics::counter!("ada_replays_total", "source" => "memory").increment(1);
                 return Ok(acted(answer, true));
@@ -264,9 +265,8 @@ impl Service {
             }
             Entry::Lead(waiter, episode) => {
                 // Whoever is more patient than usual does not wait longer than usual for a turn.
-                let due = deadline.filter(|_| self.config.engine.anytime).map(|_| arrived + patience);
-                let urgency = Urgency { turn_by: arrived + patience.min(usual), due };
-                self.submit(Seat { session: session.clone(), flight: waiter.flight().clone() }, Question { episode, observation }, urgency);
+                let turn_by = arrived + patience.min(usual);
+                self.submit(Seat { session: session.clone(), flight: waiter.flight().clone() }, Question { episode, observation }, turn_by);
                 (waiter, false)
             }
         };
@@ -274,13 +274,13 @@ impl Service {
     }
 
     /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
-    fn submit(&self, seat: Seat, question: Question, Urgency { turn_by, due }: Urgency) {
+    fn submit(&self, seat: Seat, question: Question, turn_by: Instant) {
         let agent = seat.session.agent.clone();
         let descent = match question.begin(&agent) {
             Ok(descent) => descent,
             Err(error) => return seat.session.fail(&seat.flight, ServiceError::from_agent(error)),
         };
-        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now(), turn_by, due };
+        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now(), turn_by };
         let Err((refusal, job)) = self.engine.submit(job) else { return };
         let error = match refusal {
             Refusal::Full => {
@@ -312,12 +312,6 @@ impl Service {
         }
         Ok(Duration::from_millis(ttl_ms))
     }
-}
-
-/// What the engine knows of an act's deadline; see [`Job`].
-struct Urgency {
-    turn_by: Instant,
-    due: Option<Instant>,
 }
 
 async fn wait(waiter: &Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {

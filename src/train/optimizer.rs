@@ -184,7 +184,7 @@ fn each_slot<R: Send>(slots: &mut [Slot], work: impl Fn(&mut Slot) -> Result<R> 
     let (low, high) = slots.split_at_mut(half);
     let work = &work;
     let jobs = [low, high].into_iter().map(|slots| move || slots.iter_mut().map(work).collect::<Result<Vec<R>>>()).collect();
-    let results: Result<Vec<Vec<R>>> = side_by_side(jobs)?.into_iter().collect();
+    let results: Result<Vec<Vec<R>>> = side_by_side(jobs).into_iter().collect();
     Ok(results?.into_iter().flatten().collect())
 }
 

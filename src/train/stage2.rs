@@ -83,7 +83,7 @@ impl<'a> RefineTask<'a> {
                 Ok(Part { grads: loss.affine(weight, 0.0)?.backward()?, sums: [(0.0, 0); 2], loss: 0.0, scalars })
             }));
         }
-        let parts = side_by_side(jobs)?.into_iter().collect::<Result<Vec<Part>>>()?;
+        let parts = side_by_side(jobs).into_iter().collect::<Result<Vec<Part>>>()?;
         let mean = |which: usize| {
             let (sum, count) = parts.iter().map(|part| part.sums[which]).fold((0.0, 0), |(a, n), (b, m)| (a + b, n + m));
             if count == 0 { 0.0 } else { sum / count as f64 }

@@ -1,14 +1,16 @@
 //! An act in progress: a window on its way down the ladder, one row an evaluation (sections 4.3 and 4.4 of the paper).
 
-use super::{AgentError, Chunk, Episode, LatentMode, Start, episode::Planned, episode::Window};
+use super::{
+    AgentError, Chunk, Episode, LatentMode, Start,
+    chain::Chain,
+    episode::{Planned, Window},
+};
 use crate::model::{
     config::ModelConfig,
     diffusion::{ladder::Ladder, process::Process},
-    latent::GaussianRef,
     noise::{Noise, Slot},
     trajectory::TokenRef,
 };
-use std::ops::Range;
 
 /// An act in progress. It works on a copy of the episode: dropping it leaves the old one standing. All its memory is taken when it
 /// begins; going down allocates nothing.
@@ -20,11 +22,13 @@ pub struct Descent {
     pub(super) ladder: Ladder,
     /// Whether the stored window begins at this time.
     aligned: bool,
-    started: bool,
+    pub(super) started: bool,
     /// `T * D` values.
     pub(super) x: Vec<f32>,
-    /// The network's last estimate of the clean window, `T * D` values; its position 0 is that of `x` before it was dropped.
+    /// The network's last estimate of the clean window, `T * D` values.
     x0: Vec<f32>,
+    /// Positions dropped since that estimate: position `i` of `x` is position `i + dropped` of `x0`.
+    dropped: usize,
     /// Row of the ladder.
     pub(super) row: usize,
     pub(super) chain: Chain,
@@ -35,58 +39,12 @@ pub struct Descent {
     predicted_state: Vec<f32>,
     /// Noise of one position.
     eps: Vec<f32>,
-    evaluations: u32,
+    pub(super) evaluations: u32,
     /// Evaluations that it may still take.
-    allowance: Option<usize>,
-    degraded: bool,
-    start: Start,
+    pub(super) allowance: Option<usize>,
+    pub(super) degraded: bool,
+    pub(super) start: Start,
     failed: bool,
-}
-
-/// Distributions of the latents from the act's first position on, `T + action_horizon - 1` of them; without any for a model without
-/// latents.
-#[derive(Debug)]
-pub(super) struct Chain {
-    mean: Vec<f32>,
-    log_var: Vec<f32>,
-    dim: usize,
-    /// Which one belongs to position 0 of the window.
-    first: usize,
-}
-
-impl Chain {
-    fn new(len: usize, dim: usize) -> Self {
-        Self { mean: vec![0.0; len * dim], log_var: vec![0.0; len * dim], dim, first: 0 }
-    }
-
-    /// How many belong to position 0 and those behind it.
-    pub(super) fn len(&self) -> usize {
-        self.mean.len().checked_div(self.dim).map_or(0, |len| len - self.first)
-    }
-
-    pub(super) fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    fn range(&self, position: usize) -> Range<usize> {
-        let at = (self.first + position) * self.dim;
-        at..at + self.dim
-    }
-
-    /// The latent of a position of the window.
-    pub(super) fn get(&self, position: usize) -> GaussianRef<'_> {
-        let range = self.range(position);
-        GaussianRef { mean: &self.mean[range.clone()], log_var: &self.log_var[range] }
-    }
-
-    /// Replaces it; positions beyond the last are not kept.
-    pub(super) fn set(&mut self, position: usize, latent: GaussianRef) {
-        if position < self.len() {
-            let range = self.range(position);
-            self.mean[range.clone()].copy_from_slice(latent.mean);
-            self.log_var[range].copy_from_slice(latent.log_var);
-        }
-    }
 }
 
 /// The tables that a descent walks.
@@ -108,6 +66,7 @@ impl Descent {
             started: false,
             x: vec![0.0; len * dim],
             x0: vec![0.0; len * dim],
+            dropped: 0,
             row: 0,
             chain: Chain::new(len + actions - 1, latent_dim),
             anchor: vec![0.0; latent_dim],
@@ -132,41 +91,13 @@ impl Descent {
         self.evaluations
     }
 
-    /// Bounds the evaluations that it may still take, at least one: if the ladder asks for more, the coming rows are taken in larger
-    /// jumps, and the chunk is marked degraded. Rows are those of training, whatever the jump, so each estimate is as good as ever; only
-    /// the walk between them gets coarser. `None` lifts the bound.
-    pub fn allow(&mut self, evaluations: Option<usize>) {
-        self.allowance = evaluations.map(|evaluations| evaluations.max(1));
-    }
-
-    /// Gives out what there is, without another evaluation: positions of the last estimate or, if there is none yet, of the stored
-    /// window as it is. Says whether there was anything; if so, the descent is done, and marked degraded.
-    pub(super) fn cut_short(&mut self, walk: Walk) -> bool {
-        if !self.started {
-            if self.stored_start(walk.config).is_none_or(|start| start == Start::Cold) {
-                return false;
-            }
-            self.start(walk);
-        } else if self.evaluations == 0 {
-            return false;
-        }
-        self.degraded = true;
-        while !self.is_done() {
-            if self.evaluations > 0 {
-                let rows = self.ladder.emit() - self.row;
-                self.jump_rows(rows, walk);
-                self.emit(walk);
-            } else {
-                self.emit(walk);
-                // Nothing went down: what was at rung 2 is at position 0 now.
-                self.row = self.row.saturating_sub(self.ladder.rung());
-            }
-        }
-        true
-    }
-
     pub(super) fn has_started(&self) -> bool {
         self.started
+    }
+
+    #[cfg(test)]
+    pub(super) fn x0(&self) -> &[f32] {
+        &self.x0
     }
 
     fn action_horizon(&self) -> usize {
@@ -178,7 +109,7 @@ impl Descent {
         self.emitted.len() / self.eps.len().max(1)
     }
 
-    fn actions_left(&self) -> usize {
+    pub(super) fn actions_left(&self) -> usize {
         self.action_horizon() - self.emitted()
     }
 
@@ -195,15 +126,14 @@ impl Descent {
     /// a predicted state and an older latent; a little surprise is noised away, a great one or a jump of the latent starts anew).
     pub(super) fn start(&mut self, walk: Walk) {
         self.started = true;
-        self.start = self.stored_start(walk.config).unwrap_or(Start::Cold);
-        match (self.episode.window.take(), self.start) {
-            (Some(window), Start::Warm) => self.resume(&window, window.row),
-            (Some(window), Start::Renoised(rungs)) => {
-                let row = window.row.saturating_sub(rungs as usize * self.ladder.rung());
-                self.resume(&window, row);
-                self.renoise(window.row, walk);
+        self.start = self.choose_start(walk.config);
+        match (self.start, self.episode.window.as_ref().map(|window| window.row)) {
+            (Start::Warm, Some(row)) => self.resume(row),
+            (Start::Renoised(rungs), Some(row)) => {
+                self.resume(row.saturating_sub(rungs as usize * self.ladder.rung()));
+                self.renoise(row, walk);
             }
-            (None, _) | (_, Start::Cold) => {
+            (Start::Cold, _) | (_, None) => {
                 self.row = 0;
                 if !self.chain.is_empty() {
                     self.anchor.copy_from_slice(self.chain.get(0).mean);
@@ -214,25 +144,36 @@ impl Descent {
         self.inpaint();
     }
 
-    /// How the act would start from the stored window, if there is one for this time.
-    fn stored_start(&self, config: &ModelConfig) -> Option<Start> {
-        let window = self.episode.window.as_ref().filter(|_| self.aligned && self.episode.options.streaming)?;
-        let restart = &config.restart;
-        let distance = rms(&self.state, &window.predicted_state);
-        let moved = if self.chain.is_empty() { 0.0 } else { norm(self.chain.get(0).mean, &window.anchor) };
-        let rungs = (config.plan_horizon / 4).clamp(1, config.plan_horizon.saturating_sub(1).max(1));
-        Some(if distance >= restart.cold_distance || moved / config.latent_spread.max(f32::MIN_POSITIVE) > restart.latent_jump {
-            Start::Cold
-        } else if distance >= restart.renoise_distance && config.plan_horizon > 1 {
-            Start::Renoised(rungs as u32)
-        } else {
-            Start::Warm
-        })
+    /// The window that the act before left for this time, if there is one.
+    pub(super) fn stored_window(&self) -> Option<&Window> {
+        self.episode.window.as_ref().filter(|_| self.aligned && self.episode.options.streaming)
     }
 
-    fn resume(&mut self, window: &Window, row: usize) {
-        self.x.copy_from_slice(&window.x);
-        self.anchor.copy_from_slice(&window.anchor);
+    /// Distance between the real state and the one that a window was built for.
+    pub(super) fn surprise(&self, window: &Window) -> f32 {
+        rms(&self.state, &window.predicted_state)
+    }
+
+    fn choose_start(&self, config: &ModelConfig) -> Start {
+        let Some(window) = self.stored_window() else { return Start::Cold };
+        let (restart, distance) = (&config.restart, self.surprise(window));
+        let moved = if self.chain.is_empty() { 0.0 } else { norm(self.chain.get(0).mean, &window.anchor) };
+        let rungs = (config.plan_horizon / 4).clamp(1, config.plan_horizon.saturating_sub(1).max(1));
+        if distance >= restart.cold_distance || moved / config.latent_spread.max(f32::MIN_POSITIVE) > restart.latent_jump {
+            Start::Cold
+        } else if distance >= restart.renoise_distance && config.plan_horizon > 1 {
+            Start::Renoised(rungs.min(window.row / self.ladder.rung()) as u32)
+        } else {
+            Start::Warm
+        }
+    }
+
+    /// Takes the stored window, to go on at `row`.
+    pub(super) fn resume(&mut self, row: usize) {
+        if let Some(window) = self.episode.window.take() {
+            self.x.copy_from_slice(&window.x);
+            self.anchor.copy_from_slice(&window.anchor);
+        }
         self.row = row;
     }
 
@@ -260,7 +201,7 @@ impl Descent {
     }
 
     /// Position 0 of the first action holds the real state; later ones hold what the model imagines.
-    fn inpaint(&mut self) {
+    pub(super) fn inpaint(&mut self) {
         if self.emitted.is_empty() {
             self.x[..self.state.len()].copy_from_slice(&self.state);
         }
@@ -273,7 +214,7 @@ impl Descent {
 
     /// Writes the latents of the window, `T * latent_dim` values: means, or draws by the noise of each position's absolute time.
     pub(super) fn write_latents(&self, out: &mut [f32]) {
-        for (position, out) in out.chunks_exact_mut(self.chain.dim.max(1)).enumerate() {
+        for (position, out) in out.chunks_exact_mut(self.chain.dim().max(1)).enumerate() {
             let latent = self.chain.get(position);
             match self.episode.options.latent {
                 LatentMode::Mean => out.copy_from_slice(latent.mean),
@@ -332,6 +273,7 @@ impl Descent {
             return;
         }
         self.x0.copy_from_slice(x0);
+        self.dropped = 0;
         self.x0.chunks_mut(walk.config.layout.dim()).for_each(|position| walk.config.clip(position));
         let rows = self.rows_at_once();
         self.degraded |= rows > 1;
@@ -343,17 +285,8 @@ impl Descent {
         }
     }
 
-    /// Rows to the next evaluation; never beyond the one where position 0 comes clean.
-    fn rows_at_once(&self) -> usize {
-        let left = self.ladder.emit() - self.row;
-        let Some(allowance) = self.allowance else { return 1 };
-        // The least jump with which this position and those behind it come clean in time.
-        let needed = |rows: usize| left.div_ceil(rows) + (self.actions_left() - 1) * self.ladder.rung().div_ceil(rows);
-        (1..left).find(|&rows| needed(rows) <= allowance).unwrap_or(left)
-    }
-
     /// Reverse jump of every position, by the last estimate, to its level so many rows below.
-    fn jump_rows(&mut self, rows: usize, walk: Walk) {
+    pub(super) fn jump_rows(&mut self, rows: usize, walk: Walk) {
         (0..walk.config.plan_horizon).for_each(|position| self.jump(position, rows, walk));
         self.row += rows;
     }
@@ -374,21 +307,26 @@ impl Descent {
         } else {
             self.eps.fill(0.0);
         }
-        let place = position * dim..(position + 1) * dim;
-        for ((x, x0), noise) in self.x[place.clone()].iter_mut().zip(&self.x0[place]).zip(&self.eps) {
+        let estimate = (position + self.dropped).min(walk.config.plan_horizon - 1);
+        let columns = self.x[position * dim..][..dim].iter_mut().zip(&self.x0[estimate * dim..][..dim]);
+        for ((x, x0), noise) in columns.zip(&self.eps) {
             *x = jump.x0 * x0 + jump.eps * walk.process.eps(from, *x, *x0) + scale * noise;
         }
     }
 
     /// Position 0 is clean: give its action out, drop it, and let a fresh position in at the far end.
-    fn emit(&mut self, walk: Walk) {
+    pub(super) fn emit(&mut self, walk: Walk) {
         let (dim, state_dim, last) = (self.eps.len(), walk.config.layout.state_dim, walk.config.plan_horizon - 1);
+        let begin = self.emitted.len();
         self.emitted.extend_from_slice(&self.x[..dim]);
+        // A clean position is within bounds already.
+        walk.config.clip(&mut self.emitted[begin..]);
         // What comes next: the estimate of position 1, or what stands there if nothing was estimated in this act.
-        let next = if self.evaluations > 0 { &self.x0 } else { &self.x };
+        let next = if self.evaluations > 0 { &self.x0[self.dropped * dim..] } else { &self.x };
         self.predicted_state.copy_from_slice(next.get(dim..dim + state_dim).unwrap_or(&self.x[..state_dim]));
+        self.dropped += 1;
         if !self.chain.is_empty() {
-            self.chain.first += 1;
+            self.chain.advance();
         }
         self.x.copy_within(dim.., 0);
         self.draw_position(last);
@@ -403,12 +341,14 @@ impl Descent {
         let actions: Vec<Vec<f32>> = self.emitted.chunks(layout.dim()).map(|position| position[layout.state_dim..].to_vec()).collect();
         let planned = if self.evaluations > 0 { &self.x0 } else { &self.x };
         let planned_states = planned.chunks(layout.dim()).map(|row| normalizer.state.denormalize(&row[..layout.state_dim]));
-        let latent_dim = self.chain.dim;
+        // An act that never asked the network has no latent of its own.
+        let inferred = self.chain.of_first_step();
+        let latent = if self.evaluations == 0 { self.episode.latent.clone().unwrap_or(inferred) } else { inferred };
         let chunk = Chunk {
             actions: actions.iter().map(|action| normalizer.action.denormalize(action)).collect(),
             planned_states: planned_states.collect(),
-            latent_mean: self.chain.mean[..latent_dim].to_vec(),
-            latent_log_var: self.chain.log_var[..latent_dim].to_vec(),
+            latent_mean: latent.0.clone(),
+            latent_log_var: latent.1.clone(),
             predicted_state: normalizer.state.denormalize(&self.predicted_state),
             evaluations: self.evaluations,
             start: self.start,
@@ -418,7 +358,7 @@ impl Descent {
         let window = Window { x: self.x, row: self.row, predicted_state: self.predicted_state, anchor: self.anchor };
         episode.window = episode.options.streaming.then_some(window);
         episode.planned = Some(Planned { state: self.state, actions });
-        episode.latent = (latent_dim > 0).then(|| (chunk.latent_mean.clone(), chunk.latent_log_var.clone()));
+        episode.latent = (!latent.0.is_empty()).then_some(latent);
         Ok((episode, chunk))
     }
 }

@@ -3,8 +3,10 @@
 //! `act` is a function `(Episode, Observation) -> (Episode, Chunk)`. An act in progress is a [`Descent`]; each [`Agent::advance`] costs one
 //! denoiser forward, shared by all descents given to it, whatever rungs they stand on.
 mod advance;
+mod chain;
 mod descent;
 mod episode;
+mod hurry;
 mod types;
 
 #[cfg(test)]
@@ -88,8 +90,9 @@ impl Agent {
         Ok(Descent::new(episode, self.config.normalizer.state.normalize(&state), ladder, aligned, &self.config))
     }
 
-    /// For an act that has no time for another evaluation: gives out what there is, if there is anything (the last estimate, or the
-    /// window that the act before left), and says whether there was; then the descent is done.
+    /// For an act that has no time for another evaluation: gives out what there is, and says whether there was anything: positions of the
+    /// last estimate or, if there is none yet, of the window that the act before left, as it is. Then the descent is done, and its chunk
+    /// marked degraded.
     pub fn cut_short(&self, descent: &mut Descent) -> bool {
         descent.cut_short(self.walk())
     }

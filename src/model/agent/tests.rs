@@ -276,10 +276,16 @@ fn rows_hold_the_real_state_and_refine_once_an_action() {
     assert_eq!((refined, emitted), (3, 3));
 }
 
+/// The first act of a session with seed 1.
+fn run_once(agent: &Agent, options: &SamplerOptions) -> Chunk {
+    agent.act(&agent.open(1, options).unwrap(), &observation(&mut Philox::new(1))).unwrap().1
+}
+
 /// An allowance is kept, over cold starts and chunks, with the same rows of the ladder; one that is large enough changes nothing.
 #[test]
 fn an_allowance_makes_larger_jumps() {
     let agent = agent(true, 1, unet());
+    let unrefined = |options: &SamplerOptions| run_once(&agent, &SamplerOptions { kappa: 0.0, ..options.clone() }).latent_mean;
     for (allowance, action_horizon, sub_steps) in [(1, 1, 1), (3, 1, 1), (5, 1, 3), (4, 3, 2), (7, 3, 1), (9, 2, 1), (100, 3, 2)] {
         let options = SamplerOptions { action_horizon, sub_steps, ..options() };
         let (episode, observation) = (agent.open(1, &options).unwrap(), observation(&mut Philox::new(1)));
@@ -295,34 +301,65 @@ fn an_allowance_makes_larger_jumps() {
         // Each action of a chunk takes at least one evaluation.
         assert!(chunk.evaluations as usize <= allowance.max(action_horizon), "{} of {allowance}", chunk.evaluations);
         assert_eq!(chunk.degraded, (whole.1.evaluations as usize) > allowance);
+        assert!(allowance < 3 || chunk.latent_mean != unrefined(&options), "READY is not passed by");
         if !chunk.degraded {
             assert_eq!((next, chunk), whole);
         }
     }
 }
 
-/// Without time for an evaluation, the window of the act before gives its next action as it stands, and the act after goes on from it,
-/// one rung higher; what has nothing to give says so.
+/// Without time for an evaluation, the window of the act before gives its next actions as they stand, within bounds and with the latent
+/// of the act before; each time it stands one rung higher on the ladder, and an act with time goes on from there.
 #[test]
 fn cut_short_gives_the_window_as_it_is() {
     let agent = agent(true, 1, unet());
-    let mut stream = Philox::new(7);
-    let mut see = || observation(&mut stream);
-    let fresh = agent.open(1, &options()).unwrap();
-    let mut first = agent.begin(&fresh, &see()).unwrap();
-    assert!(!agent.cut_short(&mut first) && !first.is_done(), "a cold start has nothing yet");
-    let (episode, _) = agent.act(&fresh, &see()).unwrap();
-    let stored = episode.window.as_ref().unwrap().x.clone();
-    let mut second = agent.begin(&episode, &see()).unwrap();
-    assert!(agent.cut_short(&mut second) && second.is_done());
-    let (episode, chunk) = agent.finish(second).unwrap();
-    assert_eq!((chunk.degraded, chunk.evaluations), (true, 0));
-    assert_eq!(chunk.actions[0], agent.config.normalizer.action.denormalize(&stored[3..5]));
-    let window = episode.window.as_ref().unwrap();
-    assert_eq!((window.row, &window.x[..(HORIZON - 1) * 5]), (HORIZON - 2, &stored[5..]));
-    let (_, third) = agent.act(&episode, &see()).unwrap();
-    assert_eq!((third.degraded, third.evaluations, third.start), (false, 2, Start::Warm));
-    let mut cold = [agent.begin(&fresh, &see()).unwrap()];
-    agent.advance(&mut cold).unwrap();
-    assert!(agent.cut_short(&mut cold[0]) && cold[0].is_done(), "after an evaluation there is an estimate");
+    for action_horizon in [1, 2] {
+        let mut stream = Philox::new(7);
+        let mut see = || observation(&mut stream);
+        let fresh = agent.open(1, &SamplerOptions { action_horizon, ..options() }).unwrap();
+        let mut first = agent.begin(&fresh, &see()).unwrap();
+        assert!(!agent.cut_short(&mut first) && !first.is_done(), "a cold start has nothing yet");
+        let (mut episode, whole) = agent.act(&fresh, &see()).unwrap();
+        let mut row = HORIZON - 1;
+        for _ in 0..2 {
+            let stored = episode.window.as_ref().unwrap().x.clone();
+            let mut cut = agent.begin(&episode, &see()).unwrap();
+            assert!(agent.cut_short(&mut cut) && cut.is_done());
+            let (next, chunk) = agent.finish(cut).unwrap();
+            assert_eq!((chunk.degraded, chunk.evaluations, chunk.start), (true, 0, Start::Warm));
+            assert_eq!((&chunk.latent_mean, chunk.actions.len()), (&whole.latent_mean, action_horizon));
+            for (i, action) in chunk.actions.iter().enumerate() {
+                let mut expected = stored[5 * i..5 * i + 5].to_vec();
+                agent.config.clip(&mut expected);
+                assert_eq!(*action, agent.config.normalizer.action.denormalize(&expected[3..]));
+            }
+            row -= action_horizon;
+            let window = next.window.as_ref().unwrap();
+            assert_eq!((window.row, &window.x[..(HORIZON - action_horizon) * 5]), (row, &stored[5 * action_horizon..]));
+            episode = next;
+        }
+        let (_, after) = agent.act(&episode, &see()).unwrap();
+        assert_eq!((after.degraded, after.start), (false, Start::Warm));
+        assert_eq!(after.evaluations as usize, HORIZON - row + action_horizon - 1);
+    }
+}
+
+/// After an evaluation each action of a chunk that is cut short is the estimate of its own position.
+#[test]
+fn cut_short_after_an_estimate_gives_its_positions() {
+    let agent = agent(true, 1, unet());
+    let (episode, observation) =
+        (agent.open(1, &SamplerOptions { action_horizon: 3, ..options() }).unwrap(), observation(&mut Philox::new(7)));
+    for ticks in [2, HORIZON] {
+        let mut descents = [agent.begin(&episode, &observation).unwrap()];
+        (0..ticks).for_each(|_| agent.advance(&mut descents).unwrap());
+        let [mut descent] = descents;
+        let (given, estimate) = (descent.emitted(), descent.x0().to_vec());
+        assert_eq!(given, ticks / HORIZON);
+        assert!(agent.cut_short(&mut descent) && descent.is_done());
+        let (_, chunk) = agent.finish(descent).unwrap();
+        // An estimate whose position 0 was given out already stands one position further.
+        let action = |i: usize| agent.config.normalizer.action.denormalize(&estimate[5 * i + 3..5 * i + 5]);
+        assert_eq!(chunk.actions, [action(0), action(1), action(2)], "after {ticks} evaluations");
+    }
 }

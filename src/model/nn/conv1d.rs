@@ -133,7 +133,7 @@ impl ConvLayer {
         let work = self.op.plan(shape)?.work;
         match &self.op.packed {
             Some(packed) => packed.0.run(&work, x, &packed.1, out),
-            None => self.op.pack(&values(&self.weight)?).run(&work, x, &values(&self.bias)?, out),
+            None => self.op.weights(&work, &values(&self.weight)?).run(&work, x, &values(&self.bias)?, out),
         }
         Ok(())
     }
@@ -149,8 +149,14 @@ impl Weights {
 }
 
 impl ConvOp {
+    /// Packed to be kept.
     fn pack(&self, weight: &[f32]) -> Weights {
         if self.transposed { Weights::Spread(self.shape.pack_spread(weight)) } else { Weights::Gather(self.shape.pack_gather(weight)) }
+    }
+
+    /// Packed for one use.
+    fn weights(&self, work: &Convolution, weight: &[f32]) -> Weights {
+        if self.transposed { Weights::Spread(work.spread_weights(weight)) } else { Weights::Gather(work.gather_weights(weight)) }
     }
 
     /// The layer's own (input, output) channels.
@@ -194,9 +200,9 @@ impl ConvOp {
         let (wide, narrow) = (work.batch * work.wide_steps * self.shape.c_in, work.batch * work.narrow_steps * self.shape.c_out);
         let mut dx = vec![0.0; if self.transposed { narrow } else { wide }];
         if self.transposed {
-            work.gather(dy, &self.shape.pack_gather(weight), None, &mut dx);
+            work.gather(dy, &work.gather_weights(weight), None, &mut dx);
         } else {
-            work.spread(dy, &self.shape.pack_spread(weight), None, &mut dx);
+            work.spread(dy, &work.spread_weights(weight), None, &mut dx);
         }
         dx
     }
@@ -221,7 +227,7 @@ impl CustomOp3 for ConvOp {
         let mut out = vec![0.0; shape[0] * steps * channels];
         match &self.packed {
             Some(packed) => packed.0.run(&work, slice(s1, l1)?, &packed.1, &mut out),
-            None => self.pack(slice(s2, l2)?).run(&work, slice(s1, l1)?, slice(s3, l3)?, &mut out),
+            None => self.weights(&work, slice(s2, l2)?).run(&work, slice(s1, l1)?, slice(s3, l3)?, &mut out),
         }
         let mut dims = l1.dims().to_vec();
         let last = dims.len() - 1;

@@ -5,7 +5,7 @@ use super::{
     host::{grad_like, output, slice, values},
     kernels::{
         gru::{Gru as Kernel, GruRun},
-        product::{InLine, Packed},
+        product::{Packed, Passes},
     },
     params::{Init, Params},
     value::Value,
@@ -80,7 +80,7 @@ fn join_columns(weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
 
 /// The recurrent weight `(3H, H)`, transposed.
 fn pack(weight: &[f32], hidden: usize) -> Packed {
-    Packed::new(weight, (InLine, hidden), (3 * hidden, hidden))
+    Packed::transposed(weight, hidden, (3 * hidden, hidden), &Passes::one()).kept()
 }
 
 /// The recurrence as an operation on (projected inputs, initial states, weight and bias in a line).

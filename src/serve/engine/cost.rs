@@ -3,10 +3,12 @@
 use crate::model::agent::{Agent, AgentError, Descent, Observation};
 use std::time::{Duration, Instant};
 
-/// Ticks of each length that are timed; the fastest counts.
+/// Descents of each length that are timed, and their ticks; the fastest counts, for the first ones find no memory yet.
 const ROUNDS: usize = 3;
 /// Weight of the newest tick in what the worker knows of its slowness.
 const NEWEST: f64 = 0.1;
+/// One tick counts as no slower than this: a hiccup of the machine is no reason to hurry for long.
+const SLOWEST: f64 = 4.0;
 
 /// Costs of one model on one worker.
 #[derive(Debug)]
@@ -18,35 +20,36 @@ pub(super) struct Costs {
 }
 
 impl Costs {
-    /// Ticks of every length up to `len_max`; afterwards this thread's memory for them is there.
-    pub fn measure(agent: &Agent, len_max: usize) -> Result<Self, AgentError> {
+    /// Ticks of every length up to `len_max`; afterwards this thread's memory for them is there. `go_on` is asked between lengths.
+    pub fn measure(agent: &Agent, len_max: usize, mut go_on: impl FnMut() -> bool) -> Result<Self, AgentError> {
         let mut costs = Self { ticks: Vec::with_capacity(len_max), starts: Vec::with_capacity(len_max) };
-        for len in 1..=len_max {
-            let mut descents = descents(agent, len)?;
-            let start = timed(|| agent.advance(&mut descents))?;
-            let mut tick = start;
+        for len in (1..=len_max).take_while(|_| go_on()) {
+            let (mut tick, mut start) = (Duration::MAX, Duration::MAX);
             for _ in 0..ROUNDS {
+                let mut descents = descents(agent, len)?;
+                start = start.min(timed(|| agent.advance(&mut descents))?);
                 descents.retain(|descent| !descent.is_done());
-                if descents.len() == len {
-                    tick = tick.min(timed(|| agent.advance(&mut descents))?);
-                }
+                // Where one evaluation makes a whole act, every tick is a first one.
+                tick = if descents.len() == len { tick.min(timed(|| agent.advance(&mut descents))?) } else { start };
             }
             costs.ticks.push(tick);
-            costs.starts.push(start - tick);
+            costs.starts.push(start.saturating_sub(tick));
         }
         Ok(costs)
     }
 
-    /// A tick of `len` descents on their way.
-    pub fn tick(&self, len: usize) -> Duration {
-        of(&self.ticks, len)
+    /// A tick of `len` descents, with the start of `fresh` among them.
+    pub fn tick(&self, len: usize, fresh: usize) -> Duration {
+        of(&self.ticks, len) + if fresh > 0 { of(&self.starts, fresh) } else { Duration::ZERO }
     }
 
-    /// Ticks of `len` descents that fit into `left`, if everything takes `slowness` times as long as it did at warm-up.
-    pub fn ticks_within(&self, left: Duration, len: usize, has_started: bool, slowness: f64) -> usize {
-        let start = if has_started { Duration::ZERO } else { of(&self.starts, len) };
+    /// Ticks of `len` descents that fit into `left` for one that has started or not, if each waits for `others` too and everything takes
+    /// `slowness` times as long as it did at warm-up.
+    pub fn ticks_within(&self, left: Duration, (len, started): (usize, bool), others: Duration, slowness: f64) -> usize {
+        let start = if started { Duration::ZERO } else { of(&self.starts, len) };
+        let tick = (self.tick(len, 0) + others).as_secs_f64();
         let left = left.as_secs_f64() - slowness * start.as_secs_f64();
-        (left / (slowness * self.tick(len).as_secs_f64()).max(1e-9)).max(0.0) as usize
+        (left / (slowness * tick).max(1e-9)).max(0.0) as usize
     }
 }
 
@@ -67,8 +70,16 @@ impl Slowness {
 
     /// Takes note of a tick that was to take `expected`.
     pub fn note(&mut self, took: Duration, expected: Duration) {
-        let ratio = took.as_secs_f64() / expected.as_secs_f64().max(1e-9);
-        self.0 = (self.0 + NEWEST * (ratio - self.0)).max(1.0);
+        self.lean(took.as_secs_f64() / expected.as_secs_f64().max(1e-9));
+    }
+
+    /// An act was cut short and told nothing about the machine: without this, acts that are never computed would keep the mean up.
+    pub fn forget(&mut self) {
+        self.lean(1.0);
+    }
+
+    fn lean(&mut self, ratio: f64) {
+        self.0 = (self.0 + NEWEST * (ratio.min(SLOWEST) - self.0)).max(1.0);
     }
 }
 
@@ -100,18 +111,25 @@ mod tests {
     #[test]
     fn ticks_that_fit() {
         let costs = Costs { ticks: vec![ms(2), ms(3)], starts: vec![ms(4), ms(5)] };
-        assert_eq!(costs.ticks_within(ms(9), 1, true, 1.0), 4);
-        assert_eq!(costs.ticks_within(ms(9), 1, false, 1.0), 2);
-        assert_eq!(costs.ticks_within(ms(9), 1, true, 2.0), 2);
-        assert_eq!(costs.ticks_within(ms(10), 7, true, 1.0), 3, "the longest that was measured");
-        assert_eq!(costs.ticks_within(ms(3), 1, false, 1.0), 0);
+        let within = |left, len, started, others, slowness| costs.ticks_within(ms(left), (len, started), ms(others), slowness);
+        assert_eq!(within(9, 1, true, 0, 1.0), 4);
+        assert_eq!(within(9, 1, false, 0, 1.0), 2);
+        assert_eq!(within(9, 1, true, 0, 2.0), 2);
+        assert_eq!(within(9, 1, true, 2, 1.0), 2);
+        assert_eq!(within(10, 7, true, 0, 1.0), 3, "the longest that was measured");
+        assert_eq!(within(3, 1, false, 0, 1.0), 0);
+        assert_eq!(costs.tick(2, 1), ms(7));
     }
 
     #[test]
-    fn slowness_follows_and_never_falls_below_one() {
+    fn slowness_follows_and_comes_back() {
         let mut slowness = Slowness::default();
         (0..100).for_each(|_| slowness.note(ms(30), ms(10)));
         assert!((slowness.get() - 3.0).abs() < 0.01);
+        slowness.note(ms(60_000), ms(10));
+        assert!(slowness.get() < 3.2, "one hiccup is no more than that");
+        (0..100).for_each(|_| slowness.forget());
+        assert!(slowness.get() < 1.01);
         (0..100).for_each(|_| slowness.note(ms(1), ms(10)));
         assert!((slowness.get() - 1.0).abs() < 1e-9);
     }

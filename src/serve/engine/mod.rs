@@ -31,6 +31,9 @@ pub trait Ticket: Send + 'static {
     fn is_wanted(&self) -> bool;
     /// It has left the queue.
     fn start(&self);
+    /// When its answer is late, if everyone who waits prefers a coarser one in time: the act may be degraded. Asked between network
+    /// evaluations.
+    fn due(&self) -> Option<Instant>;
     /// It is over.
     fn settle(self, outcome: Result<Finished, Failure>);
 }
@@ -67,8 +70,6 @@ pub struct Job<T> {
     pub submitted: Instant,
     /// When it should have had its turn: the queue's order.
     pub turn_by: Instant,
-    /// When its answer is late, if a coarser one in time is better than none: the act may be degraded.
-    pub due: Option<Instant>,
 }
 
 /// An act computed.

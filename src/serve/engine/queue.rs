@@ -89,6 +89,11 @@ impl<J> Queue<J> {
         Some(earliest.map(|Reverse(waiting)| waiting.job).collect())
     }
 
+    /// Whether it has ended.
+    pub fn is_closed(&self) -> bool {
+        self.inner.lock().closed
+    }
+
     /// Lets idle workers look around.
     pub fn wake(&self) {
         self.ready.notify_all();

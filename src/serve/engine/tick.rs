@@ -8,7 +8,7 @@ use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode};
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, Weak},
-    time::Instant,
+    time::{Duration, Instant},
 };
 
 /// The acts in progress of one worker, by model.
@@ -29,13 +29,20 @@ struct Group<T> {
     riders: Vec<Rider<T>>,
 }
 
+/// What an act in a hurry must know beside its batch.
+#[derive(Clone, Copy)]
+struct Pace {
+    /// A tick of the other models' acts, which stand between two of its own.
+    others: Duration,
+    /// Time kept for what follows the last evaluation.
+    margin: Duration,
+}
+
 struct Rider<T> {
     question: Question,
     ticket: T,
     submitted: Instant,
     started: Instant,
-    /// When its last evaluation must be over, if it is in a hurry.
-    due: Option<Instant>,
     /// Evaluations spent on it, to count what is wasted if it is dropped.
     evaluations: u64,
 }
@@ -51,8 +58,8 @@ impl<T: Ticket> Batch<T> {
     }
 
     /// Gets ready for a model; see [`Costs::measure`].
-    pub fn warm_up(&mut self, agent: &Arc<Agent>) -> Result<(), Failure> {
-        let costs = guarded(|| Costs::measure(agent, self.options.batch_len_max))?;
+    pub fn warm_up(&mut self, agent: &Arc<Agent>, go_on: impl FnMut() -> bool) -> Result<(), Failure> {
+        let costs = guarded(|| Costs::measure(agent, self.options.batch_len_max, go_on))?;
         self.costs.retain(|(known, _)| known.strong_count() > 0);
         self.costs.push((Arc::downgrade(agent), Arc::new(costs)));
         Ok(())
@@ -60,22 +67,23 @@ impl<T: Ticket> Batch<T> {
 
     /// Takes an act in; it takes part from the next tick on.
     pub fn admit(&mut self, job: Job<T>) {
-        let Job { agent, question, descent, ticket, submitted, due, .. } = job;
+        let Job { agent, question, descent, ticket, submitted, turn_by: _ } = job;
         if !ticket.is_wanted() {
             return;
         }
         ticket.start();
-        let margin = self.options.deadline_margin;
-        let due = due.map(|due| due.checked_sub(margin).unwrap_or(due));
         let group = self.group(agent);
         group.descents.push(descent);
-        group.riders.push(Rider { question, ticket, submitted, started: Instant::now(), due, evaluations: 0 });
+        group.riders.push(Rider { question, ticket, submitted, started: Instant::now(), evaluations: 0 });
     }
 
     /// One evaluation for every act; those that are done leave.
     pub fn tick(&mut self) {
+        let expected: Duration = self.groups.iter().map(Group::expected).sum();
+        let margin = self.options.deadline_margin;
         for group in &mut self.groups {
-            group.tick(&mut self.slowness);
+            let others = expected.saturating_sub(group.expected());
+            group.tick(&mut self.slowness, Pace { others, margin });
         }
         self.groups.retain(|group| !group.riders.is_empty());
     }
@@ -99,26 +107,26 @@ impl<T: Ticket> Batch<T> {
 }
 
 impl<T: Ticket> Group<T> {
-    fn tick(&mut self, slowness: &mut Slowness) {
+    fn tick(&mut self, slowness: &mut Slowness, pace: Pace) {
         self.drop_unwanted();
-        self.hurry(slowness.get());
+        self.hurry(slowness, pace);
         self.harvest();
         if self.riders.is_empty() {
             return;
         }
         metrics::counter!("ada_batches_total").increment(1);
         metrics::histogram!("ada_batch_size").record(self.riders.len() as f64);
-        let (begin, on_their_way) = (Instant::now(), self.descents.iter().all(|descent| descent.evaluations() > 0));
+        let (begin, expected) = (Instant::now(), self.expected());
         if guarded(|| self.agent.advance(&mut self.descents)).is_err() {
             // Whose fault it was is unknown, and the descents may be half advanced: each act starts again, alone.
             self.descents.clear();
             for rider in self.riders.drain(..) {
-                rider.ride_alone(&self.agent);
+                rider.ride_alone(&self.agent, self.costs.as_deref(), pace);
             }
             return;
         }
-        if let Some(costs) = self.costs.as_ref().filter(|_| on_their_way) {
-            slowness.note(begin.elapsed(), costs.tick(self.riders.len()));
+        if self.costs.is_some() {
+            slowness.note(begin.elapsed(), expected);
         }
         for rider in &mut self.riders {
             rider.evaluations += 1;
@@ -126,17 +134,25 @@ impl<T: Ticket> Group<T> {
         self.harvest();
     }
 
+    /// What the next tick would have taken at warm-up.
+    fn expected(&self) -> Duration {
+        let fresh = self.descents.iter().filter(|descent| descent.evaluations() == 0).count();
+        self.costs.as_ref().map_or(Duration::ZERO, |costs| costs.tick(self.riders.len(), fresh))
+    }
+
     /// Tells acts in a hurry how many evaluations they have time for; one that has time for none gives out what it has.
-    fn hurry(&mut self, slowness: f64) {
-        let (Some(costs), len) = (&self.costs, self.riders.len()) else { return };
-        let now = Instant::now();
-        for (descent, rider) in self.descents.iter_mut().zip(&self.riders) {
-            let Some(due) = rider.due else { continue };
-            let ticks = costs.ticks_within(due.saturating_duration_since(now), len, descent.evaluations() > 0, slowness);
-            if ticks == 0 && self.agent.cut_short(descent) {
-                continue;
+    fn hurry(&mut self, slowness: &mut Slowness, pace: Pace) {
+        let Some(costs) = &self.costs else { return };
+        for i in (0..self.riders.len()).rev() {
+            let batch = (costs.as_ref(), self.riders.len(), slowness.get());
+            match self.riders[i].hurry(&self.agent, &mut self.descents[i], batch, pace) {
+                Ok(true) => slowness.forget(),
+                Ok(false) => {}
+                Err(_) => {
+                    self.descents.swap_remove(i);
+                    self.riders.swap_remove(i).ride_alone(&self.agent, None, pace);
+                }
             }
-            descent.allow(Some(ticks));
         }
     }
 
@@ -161,8 +177,24 @@ impl<T: Ticket> Group<T> {
 }
 
 impl<T: Ticket> Rider<T> {
+    /// See [`Group::hurry`]; the batch is its costs, length and slowness. Says whether the act was cut short.
+    fn hurry(&self, agent: &Agent, descent: &mut Descent, batch: (&Costs, usize, f64), pace: Pace) -> Result<bool, Failure> {
+        let Some(due) = self.ticket.due() else {
+            descent.allow(None);
+            return Ok(false);
+        };
+        let (costs, len, slowness) = batch;
+        let left = due.saturating_duration_since(Instant::now()).saturating_sub(pace.margin);
+        let ticks = costs.ticks_within(left, (len, descent.evaluations() > 0), pace.others, slowness);
+        if ticks == 0 && guarded(|| Ok(agent.cut_short(descent)))? {
+            return Ok(true);
+        }
+        descent.allow(Some(ticks));
+        Ok(false)
+    }
+
     /// The whole act without batch mates, from the beginning: the result is the same, for noise does not depend on the batch.
-    fn ride_alone(mut self, agent: &Agent) {
+    fn ride_alone(mut self, agent: &Agent, costs: Option<&Costs>, pace: Pace) {
         let mut descent = match guarded(|| self.question.begin(agent)) {
             Ok(descent) => descent,
             Err(failure) => return self.ticket.settle(Err(failure)),
@@ -171,7 +203,9 @@ impl<T: Ticket> Rider<T> {
             if !self.ticket.is_wanted() {
                 return self.count_waste();
             }
-            if let Err(failure) = guarded(|| agent.advance(std::slice::from_mut(&mut descent))) {
+            let hurried = costs.map_or(Ok(false), |costs| self.hurry(agent, &mut descent, (costs, 1, 1.0), pace));
+            let advanced = hurried.and_then(|cut| if cut { Ok(()) } else { guarded(|| agent.advance(std::slice::from_mut(&mut descent))) });
+            if let Err(failure) = advanced {
                 return self.ticket.settle(Err(failure));
             }
             self.evaluations += 1;

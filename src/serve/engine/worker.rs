@@ -21,8 +21,11 @@ fn run<T: Ticket>(shared: &Shared<T>, index: usize) {
         let asked = shared.warm_ups[index].lock().as_mut().map(std::mem::take).unwrap_or_default();
         for (agent, done) in asked {
             // Whoever asked may have gone meanwhile.
-            let _gone = done.send(batch.warm_up(&agent));
-            shared.beat(index);
+            let go_on = || {
+                shared.beat(index);
+                !shared.queue.is_closed()
+            };
+            let _gone = done.send(batch.warm_up(&agent, go_on));
         }
         let held = batch.len();
         let Some(arrivals) = shared.queue.take(held, ended, shared.options.batch_len_max.saturating_sub(held)) else { break };

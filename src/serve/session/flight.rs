@@ -4,6 +4,7 @@ use crate::serve::{
     error::{ServiceError, Stage},
     session::{Key, Outcome, Session},
 };
+use parking_lot::Mutex;
 use std::{
     sync::{
         Arc,
@@ -24,13 +25,15 @@ pub struct Flight {
     /// Nobody can join once this is 0: the flight is over.
     waiters: AtomicUsize,
     computing: AtomicBool,
+    /// When its answer is late for everyone who waits, if all of them prefer a coarser one in time.
+    due: Mutex<Option<Instant>>,
     outcome: watch::Sender<Option<Outcome>>,
 }
 
 impl Flight {
-    pub(super) fn new(step: u64, key: Key, arrived: Instant) -> Arc<Self> {
+    pub(super) fn new(step: u64, key: Key, arrived: Instant, due: Option<Instant>) -> Arc<Self> {
         let (waiters, computing, outcome) = (AtomicUsize::new(1), AtomicBool::new(false), watch::Sender::new(None));
-        Arc::new(Self { step, key, arrived, waiters, computing, outcome })
+        Arc::new(Self { step, key, arrived, waiters, computing, due: Mutex::new(due), outcome })
     }
 
     /// Whether somebody waits and there is no outcome yet.
@@ -41,6 +44,17 @@ impl Flight {
     /// Marks that it left the queue.
     pub fn start(&self) {
         self.computing.store(true, Ordering::Relaxed);
+    }
+
+    /// When a coarser answer is better than a later one; never, if somebody waits who has time.
+    pub fn due(&self) -> Option<Instant> {
+        *self.due.lock()
+    }
+
+    /// One more waits: the most patient decides.
+    fn wait_until(&self, due: Option<Instant>) {
+        let mut first = self.due.lock();
+        *first = first.zip(due).map(|(first, due)| first.max(due));
     }
 
     /// Queue or compute.
@@ -72,9 +86,10 @@ impl Waiter {
     }
 
     /// None if the last one has left already.
-    pub(super) fn join(session: &Arc<Session>, flight: &Arc<Flight>) -> Option<Self> {
+    pub(super) fn join(session: &Arc<Session>, flight: &Arc<Flight>, due: Option<Instant>) -> Option<Self> {
         let one_more = |waiters| (waiters > 0).then_some(waiters + 1);
         flight.waiters.fetch_update(Ordering::AcqRel, Ordering::Acquire, one_more).ok()?;
+        flight.wait_until(due);
         Some(Self { session: session.clone(), flight: flight.clone() })
     }
 

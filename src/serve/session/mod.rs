@@ -159,11 +159,11 @@ impl Session {
         Self { id: Uuid::new_v4(), model, agent, options, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
     }
 
-    /// Takes up a step: replays, joins or leads it.
+    /// Takes up a step: replays, joins or leads it; after `due` the caller prefers a coarser answer to a later one.
     ///
     /// # Errors
     /// If the step is out of order, busy, or known with another observation, or if the session has ended.
-    pub fn enter(self: &Arc<Self>, step: u64, key: Key, now: Instant) -> Result<Entry, ServiceError> {
+    pub fn enter(self: &Arc<Self>, step: u64, key: Key, now: Instant, due: Option<Instant>) -> Result<Entry, ServiceError> {
         let mut slot = self.slot.lock();
         if slot.ended {
             return Err(ServiceError::SessionNotFound);
@@ -185,11 +185,11 @@ impl Session {
             if flight.key != key {
                 return Err(ServiceError::StepPayloadMismatch { step, committed });
             }
-            if let Some(waiter) = Waiter::join(self, flight) {
+            if let Some(waiter) = Waiter::join(self, flight, due) {
                 return Ok(Entry::Join(waiter));
             }
         }
-        let waiter = Waiter::lead(self, Flight::new(step, key, now));
+        let waiter = Waiter::lead(self, Flight::new(step, key, now, due));
         slot.flight = Some(waiter.flight().clone());
         Ok(Entry::Lead(waiter, slot.committed.episode.clone()))
     }

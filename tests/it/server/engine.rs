@@ -21,6 +21,7 @@ type Outcome = Result<Finished, Failure>;
 struct Seat {
     outcome: mpsc::Sender<Outcome>,
     gate: Option<mpsc::Receiver<()>>,
+    due: Option<Instant>,
 }
 
 impl Ticket for Seat {
@@ -32,6 +33,10 @@ impl Ticket for Seat {
         if let Some(gate) = &self.gate {
             gate.recv().unwrap();
         }
+    }
+
+    fn due(&self) -> Option<Instant> {
+        self.due
     }
 
     fn settle(self, outcome: Outcome) {
@@ -61,9 +66,9 @@ fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Recei
     let question = Question { episode, observation };
     let descent = question.begin(asked).unwrap();
     let (outcome, receiver) = mpsc::channel();
-    let ticket = Seat { outcome, gate: None };
+    let ticket = Seat { outcome, gate: None, due: None };
     let now = Instant::now();
-    (Job { agent: run_on.clone(), question, descent, ticket, submitted: now, turn_by: now, due: None }, receiver)
+    (Job { agent: run_on.clone(), question, descent, ticket, submitted: now, turn_by: now }, receiver)
 }
 
 fn one_worker(batch_len_max: usize) -> Engine<Seat> {
@@ -124,29 +129,41 @@ fn a_deadline_makes_larger_jumps() {
     let engine = one_worker(8);
     engine.warm_up(&slow).unwrap();
     engine.warm_up(&tiny).unwrap();
-    let (mut hasty, outcome) = job(&slow, &slow, 1);
-    hasty.due = Some(Instant::now() + Duration::from_millis(400));
-    assert!(engine.submit(hasty).is_ok());
-    let finished = outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap();
-    assert!(finished.chunk.degraded && finished.chunk.evaluations > 20, "{:?}", finished.chunk.evaluations);
-    assert!(finished.compute < Duration::from_secs(5));
-    let (mut late, outcome) = job(&slow, &slow, 1);
-    late.due = Some(Instant::now());
-    assert!(engine.submit(late).is_ok());
-    let finished = outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap();
+    let act = |mut job: Job<Seat>, outcome: mpsc::Receiver<Outcome>, due: Instant| {
+        job.ticket.due = Some(due);
+        assert!(engine.submit(job).is_ok());
+        outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap()
+    };
+    let (hasty, outcome) = job(&slow, &slow, 1);
+    let finished = act(hasty, outcome, Instant::now() + Duration::from_millis(400));
+    assert!(finished.chunk.degraded && finished.compute < Duration::from_secs(10));
+    let (late, outcome) = job(&slow, &slow, 1);
+    let finished = act(late, outcome, Instant::now());
     assert_eq!((finished.chunk.degraded, finished.chunk.evaluations), (true, 1), "nothing to give out before the first evaluation");
-    let (mut calm, outcome) = job(&tiny, &tiny, 3);
-    calm.due = Some(Instant::now() + Duration::from_secs(3600));
+    let (mut next, outcome) = job(&slow, &slow, 1);
+    next.question.episode = Arc::new(finished.episode);
+    next.descent = next.question.begin(&slow).unwrap();
+    let finished = act(next, outcome, Instant::now());
+    assert_eq!((finished.chunk.degraded, finished.chunk.evaluations), (true, 0), "the window of the act before");
+    let (calm, outcome) = job(&tiny, &tiny, 3);
     let expected = tiny.act(&calm.question.episode, &calm.question.observation).unwrap().1;
-    assert!(engine.submit(calm).is_ok());
-    assert_eq!(outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap().chunk, expected);
+    assert_eq!(act(calm, outcome, Instant::now() + Duration::from_secs(3600)).chunk, expected);
 }
 
 /// A model that nobody warmed up is served all the same; only, its acts are never hurried.
 #[test]
+fn without_warm_up_nobody_hurries() {
+    let (tiny, engine) = (agent("tiny"), one_worker(8));
+    let (mut late, outcome) = job(&tiny, &tiny, 3);
+    late.ticket.due = Some(Instant::now());
+    let expected = tiny.act(&late.question.episode, &late.question.observation).unwrap().1;
+    assert!(engine.submit(late).is_ok());
+    assert_eq!(outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap().chunk, expected);
+}
+
+#[test]
 fn an_ended_engine_does_not_warm_up() {
     let engine = one_worker(2);
     engine.stop(Duration::from_secs(5));
-    let tiny = agent("tiny");
-    assert!(matches!(engine.warm_up(&tiny), Err(Failure::Stopped)));
+    assert!(matches!(engine.warm_up(&agent("tiny")), Err(Failure::Stopped)));
 }

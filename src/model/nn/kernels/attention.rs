@@ -5,7 +5,7 @@
 use super::{
     math, per_isa,
     pool::Pooled,
-    product::{Every, InLine, Left, Packed, Start, even_rows, product},
+    product::{Every, InLine, Left, Packed, Passes, Start, even_rows, product},
 };
 
 /// Sizes of an attention.
@@ -44,7 +44,7 @@ impl Matrix<'_> {
     }
 
     fn pack_transposed(&self) -> Packed {
-        Packed::scratch(self.values, (InLine, self.columns), (self.rows, self.stride))
+        Packed::transposed(self.values, self.columns, (self.rows, self.stride), &Passes::one())
     }
 
     fn times(&self, b: &Packed, out: &mut [f32], out_stride: usize) {

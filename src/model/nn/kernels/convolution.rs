@@ -10,7 +10,7 @@
 use super::{
     join,
     pool::Pooled,
-    product::{Every, InLine, Left, Packed, Precision, Row, Start, Table, even_rows, product},
+    product::{InLine, Left, Packed, Passes, Precision, Row, Start, Table, even_rows, product},
 };
 use std::ops::Range;
 
@@ -56,21 +56,30 @@ impl Phases {
 }
 
 impl ConvShape {
-    /// The weights for [`Convolution::gather`].
+    /// The weights for [`Convolution::gather`], to be kept.
     pub fn pack_gather(&self, weight: &[f32]) -> Packed {
-        let row = self.c_in * self.kernel;
-        let k_offset: Vec<usize> = (0..self.kernel).flat_map(|tap| (0..self.c_in).map(move |c| c * self.kernel + tap)).collect();
-        Packed::interleaved(weight, (Table(&k_offset), k_offset.len()), (self.c_out, row), self.kernel)
+        self.gather_weights(weight, 0..self.kernel).kept()
     }
 
-    /// The weights for [`Convolution::spread`].
+    /// The weights for [`Convolution::spread`], to be kept.
     pub fn pack_spread(&self, weight: &[f32]) -> Phases {
+        Phases(self.spread_weights(weight).0.into_iter().map(Packed::kept).collect())
+    }
+
+    /// The weights of these taps for [`Convolution::gather`], in memory of the pool; those of the others are not filled.
+    fn gather_weights(&self, weight: &[f32], taps: Range<usize>) -> Packed {
+        let row = self.c_in * self.kernel;
+        Packed::transposed(weight, row, (self.c_out, row), &Passes { count: self.kernel, needed: taps })
+    }
+
+    /// The weights for [`Convolution::spread`], in memory of the pool.
+    fn spread_weights(&self, weight: &[f32]) -> Phases {
         let row = self.c_in * self.kernel;
         let phase = |residue: usize| {
             let taps = (residue..self.kernel).step_by(self.stride).rev();
-            let count = taps.len();
+            let passes = Passes { count: taps.len(), needed: 0..taps.len() };
             let k_offset: Vec<usize> = taps.flat_map(|tap| (0..self.c_out).map(move |o| o * row + tap)).collect();
-            Packed::interleaved(weight, (Table(&k_offset), k_offset.len()), (self.c_in, self.kernel), count)
+            Packed::interleaved(weight, (Table(&k_offset), k_offset.len()), (self.c_in, self.kernel), passes)
         };
         Phases((0..self.stride).map(phase).collect())
     }
@@ -92,6 +101,19 @@ fn inside(first: usize, taps: usize, front: usize, steps: usize) -> Range<usize>
 }
 
 impl Convolution {
+    /// The weights for [`Self::gather`] of this work alone, in memory of the pool.
+    pub fn gather_weights(&self, weight: &[f32]) -> Packed {
+        let ConvShape { kernel, stride, padding, .. } = self.shape;
+        let last = self.narrow_steps.saturating_sub(1) * stride;
+        let taps = padding.saturating_sub(last).min(kernel)..kernel.min(self.wide_steps + padding);
+        self.shape.gather_weights(weight, taps)
+    }
+
+    /// The weights for [`Self::spread`] of this work alone, in memory of the pool.
+    pub fn spread_weights(&self, weight: &[f32]) -> Phases {
+        self.shape.spread_weights(weight)
+    }
+
     /// The convolution proper: `y[b, t, o] = bias[o] + sum over tap, c of x[b, t stride + tap - padding, c] w[o, c, tap]` into `out`,
     /// `(batch, narrow_steps, c_out)`.
     pub fn gather(&self, x: &[f32], weight: &Packed, bias: Option<&[f32]>, out: &mut [f32]) {
@@ -137,21 +159,31 @@ impl Convolution {
         }
     }
 
-    /// The gradient to the weights: `dw[o, c, tap] = sum over b, t of x[b, t stride + tap - padding, c] dy[b, t, o]`.
+    /// The gradient to the weights: `dw[o, c, tap] = sum over b, t of x[b, t stride + tap - padding, c] dy[b, t, o]`. Chains run over
+    /// time, then items, so that a tap skips the times at which it falls on padding.
     pub fn weight_grad(&self, x: &[f32], dy: &[f32]) -> Vec<f32> {
-        let ConvShape { c_in, c_out, kernel, padding, .. } = self.shape;
-        let packed = Packed::scratch(dy, (Every(c_out), self.batch * self.narrow_steps), (c_out, 1));
-        let window_starts = self.window_starts();
+        let ConvShape { c_in, c_out, kernel, stride, padding } = self.shape;
+        let (batch, steps, narrow_steps) = (self.batch, self.padded_steps(), self.narrow_steps);
+        let by_time = |window: usize, step: usize| -> Vec<usize> {
+            (0..narrow_steps).flat_map(|t| (0..batch).map(move |b| b * window + t * step)).collect()
+        };
+        let (places, windows) = (by_time(narrow_steps * c_out, c_out), by_time(steps * c_in, stride * c_in));
+        let packed = Packed::scratch(dy, (Table(&places), places.len()), (c_out, 1));
         let held;
         let values = if padding == 0 {
             x
         } else {
-            held = padded(x, self.wide_steps * c_in, padding * c_in, self.padded_steps() * c_in);
+            held = padded(x, self.wide_steps * c_in, padding * c_in, steps * c_in);
             &held
         };
         let mut transposed = Pooled::take(kernel * c_in * c_out);
-        let rows = even_rows(kernel * c_in, 1, c_out, packed.terms());
-        product(Left { values, terms: Table(&window_starts) }, &packed, Start::Zero, &mut transposed, rows);
+        let rows = (0..kernel).flat_map(|tap| {
+            let first = padding.saturating_sub(tap).div_ceil(stride).min(narrow_steps);
+            let end = (self.wide_steps + padding).saturating_sub(tap).div_ceil(stride).clamp(first, narrow_steps);
+            let terms = first * batch..end * batch;
+            (0..c_in).map(move |c| tap * c_in + c).map(move |row| Row { from: row, to: row * c_out, terms: terms.clone() })
+        });
+        product(Left { values, terms: Table(&windows) }, &packed, Start::Zero, &mut transposed, rows);
         let order: Vec<usize> = (0..c_in).flat_map(|c| (0..kernel).map(move |tap| tap * c_in + c)).collect();
         join::transpose(&transposed, c_out, &order)
     }
@@ -159,13 +191,6 @@ impl Convolution {
     /// Steps of a padded window.
     fn padded_steps(&self) -> usize {
         self.wide_steps + 2 * self.shape.padding
-    }
-
-    /// Where in the padded buffer each output's window starts.
-    fn window_starts(&self) -> Vec<usize> {
-        let ConvShape { c_in, stride, .. } = self.shape;
-        let steps = self.padded_steps();
-        (0..self.batch).flat_map(|b| (0..self.narrow_steps).map(move |t| (b * steps + t * stride) * c_in)).collect()
     }
 }
 

@@ -5,7 +5,7 @@
 use super::{
     join, math, per_isa,
     pool::Pooled,
-    product::{Every, InLine, Left, Packed, Row, Start, even_rows, product},
+    product::{Every, InLine, Left, Packed, Passes, Row, Start, even_rows, product},
 };
 
 /// Sizes of a GRU at work.
@@ -133,7 +133,7 @@ impl Gru {
         let (size, row, count) = (self.hidden, 3 * self.hidden, self.batch * self.steps);
         let before = self.states_before(run);
         let mut projected = vec![0.0; count * row];
-        let forward = Packed::scratch(recurrent.0, (InLine, size), (row, size));
+        let forward = Packed::transposed(recurrent.0, size, (row, size), &Passes::one());
         let rows = even_rows(count, size, row, size);
         product(Left { values: &before, terms: InLine }, &forward, Start::Bias(recurrent.1), &mut projected, rows);
         let back = Packed::scratch(recurrent.0, (Every(size), row), (size, 1));

@@ -1,6 +1,9 @@
 //! Adding and laying side by side, channels last.
 
-use super::per_isa;
+use super::{
+    per_isa,
+    transpose::{self, SIDE},
+};
 
 per_isa! {
     /// `out[c] += sum over rows of x[row, c]`, in ascending order of rows; `x` is `(rows, channels)`.
@@ -85,16 +88,17 @@ pub fn split(joined: &[f32], widths: [usize; 2]) -> [Vec<f32>; 2] {
     [a, b]
 }
 
-/// The rows of a matrix of `columns` columns, in the given order, as columns; by strips of 16, so that what is read and written stays
-/// in the cache.
+/// The rows of a matrix of `columns` columns, in the given order, as columns; block by block.
 pub fn transpose(matrix: &[f32], columns: usize, order: &[usize]) -> Vec<f32> {
-    const STRIP: usize = 16;
     let rows = order.len();
     let mut out = vec![0.0; matrix.len()];
-    for (strip, out) in out.chunks_mut(STRIP * rows).enumerate() {
-        for (i, row) in order.iter().enumerate() {
-            let row = &matrix[row * columns..][strip * STRIP..columns.min((strip + 1) * STRIP)];
-            out[i..].iter_mut().step_by(rows).zip(row).for_each(|(out, value)| *out = *value);
+    for column in (0..columns).step_by(SIDE) {
+        let width = SIDE.min(columns - column);
+        for (start, order) in order.chunks(SIDE).enumerate() {
+            let block = transpose::transpose(&transpose::gather(order.len(), width, |i| &matrix[order[i] * columns + column..]));
+            for (j, turned) in block[..width].iter().enumerate() {
+                out[(column + j) * rows + start * SIDE..][..order.len()].copy_from_slice(&turned[..order.len()]);
+            }
         }
     }
     out

@@ -14,6 +14,7 @@ pub mod norm;
 pub mod optimizer;
 pub mod pool;
 pub mod product;
+pub mod transpose;
 
 use std::sync::OnceLock;
 

@@ -1,0 +1,65 @@
+//! The latents of an act in progress.
+
+use crate::model::latent::GaussianRef;
+use std::ops::Range;
+
+/// Distributions of the latents from the act's first position on, `T + action_horizon - 1` of them; without any for a model without
+/// latents.
+#[derive(Debug)]
+pub(super) struct Chain {
+    mean: Vec<f32>,
+    log_var: Vec<f32>,
+    dim: usize,
+    /// Which one belongs to position 0 of the window.
+    first: usize,
+}
+
+impl Chain {
+    pub(super) fn new(len: usize, dim: usize) -> Self {
+        Self { mean: vec![0.0; len * dim], log_var: vec![0.0; len * dim], dim, first: 0 }
+    }
+
+    /// How many belong to position 0 and those behind it.
+    pub(super) fn len(&self) -> usize {
+        self.mean.len().checked_div(self.dim).map_or(0, |len| len - self.first)
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Width of a latent.
+    pub(super) fn dim(&self) -> usize {
+        self.dim
+    }
+
+    /// Position 0 has been given out: the next one takes its place.
+    pub(super) fn advance(&mut self) {
+        self.first += 1;
+    }
+
+    /// Mean and log-variance at the act's first position.
+    pub(super) fn of_first_step(&self) -> (Vec<f32>, Vec<f32>) {
+        (self.mean[..self.dim].to_vec(), self.log_var[..self.dim].to_vec())
+    }
+
+    fn range(&self, position: usize) -> Range<usize> {
+        let at = (self.first + position) * self.dim;
+        at..at + self.dim
+    }
+
+    /// The latent of a position of the window.
+    pub(super) fn get(&self, position: usize) -> GaussianRef<'_> {
+        let range = self.range(position);
+        GaussianRef { mean: &self.mean[range.clone()], log_var: &self.log_var[range] }
+    }
+
+    /// Replaces it; positions beyond the last are not kept.
+    pub(super) fn set(&mut self, position: usize, latent: GaussianRef) {
+        if position < self.len() {
+            let range = self.range(position);
+            self.mean[range.clone()].copy_from_slice(latent.mean);
+            self.log_var[range].copy_from_slice(latent.log_var);
+        }
+    }
+}
