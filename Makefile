@@ -48,7 +48,7 @@ load: ## Puts load on the server of `make serve`: make load LOAD="--clients 32 -
 	cargo run $(CARGO_FLAGS) --quiet --example load -- $(LOAD)
 
 bench: ## Kernel, forward, act and training-step times of this machine.
-	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 cargo bench --locked
+	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 MALLOC_MMAP_THRESHOLD_=1073741824 MALLOC_TRIM_THRESHOLD_=4294967296 cargo bench --locked
 
 # PEERS_VENV may name a virtual environment that has the requirements already.
 PEERS_VENV ?= .venv-peers

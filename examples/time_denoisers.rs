@@ -13,6 +13,7 @@ use ada_diffuser::model::{
     noise::Philox,
     trajectory::Layout,
 };
+use ada_diffuser::restart;
 use ada_diffuser::train::{optimizer::Adam, parallel::side_by_side};
 use candle_core::{Result, Tensor, backprop::GradStore};
 use clap::{Parser, ValueEnum};
@@ -65,7 +66,8 @@ enum Net {
 enum What {
     /// One evaluation of all windows.
     Forward,
-    /// The bare matrix products of an evaluation, without all that stands between them.
+    /// The matrix products of an evaluation alone, as the kernels run them (with padding and what lies side by side copied), without all
+    /// that stands between them.
     Bound,
     /// One training step: mean square error, its gradient, Adam.
     Train,
@@ -73,6 +75,8 @@ enum What {
 
 fn main() -> anyhow::Result<()> {
     let flags = Flags::parse();
+    // As the trainer does.
+    restart::with_environment(&[&restart::ONE_THREAD_EACH[..], &restart::KEEP_MEMORY].concat())?;
     let config = config(&flags);
     let ms = match flags.what {
         What::Forward => forward::<Buffer>(&flags, &config)?,

@@ -7,6 +7,8 @@
 //! | [`train`] | how checkpoints are made from recorded rollouts | [`train::recipe`] |
 //! | [`serve`] | how checkpoints are used: gRPC and REST | [`serve::service`] |
 //!
+//! ([`restart`], at the door of both programs, sees to the environment that their libraries read.)
+//!
 //! ```text
 //! bin/server -> serve -> model <- train <- bin/trainer        serve and train never meet
 //! model: noise, trajectory <- normalizer <- nn <- {latent | denoiser} <- diffusion <- agent <- checkpoint
@@ -20,11 +22,14 @@
 //!    episode, an immutable value ([`model::agent::Episode`]), is leased.
 //! 3. [`model::agent::Agent::begin`] checks the observation and makes a [`model::agent::Descent`]: a window on its way down the ladder
 //!    ([`model::diffusion::ladder`]).
-//! 4. [`serve::engine`] calls [`model::agent::Agent::advance`] on all descents in flight: one forward a tick. Inside, the latent is inferred
+//! 4. [`serve::engine`], earliest deadline first, calls [`model::agent::Agent::advance`] on all descents in flight: one forward a tick, on
+//!    pooled memory. A descent that would come too late takes larger jumps. Inside, the latent is inferred
 //!    from what was really seen ([`model::latent`]), refined at rung 1 by the window itself (zig-zag), and the denoiser
 //!    ([`model::denoiser`]) takes every window one row down.
 //! 5. A finished descent is a new episode and a [`model::agent::Chunk`]; the session commits both together, if the step is still the
 //!    same, and the answer goes out.
+//!
+//! Networks are written once, over any [`model::nn::Value`]: [`model::nn::Buffer`]s here, candle's tensors in training.
 //!
 //! Training is the mirror: recipe -> data set -> stage 1 ([`model::latent::elbo`]) -> stage 2 ([`model::diffusion::refine`]) ->
 //! [`model::checkpoint`]. Losses live beside the networks they train; [`train`] turns the crank.
@@ -42,5 +47,6 @@
 //! | p_phi, q_psi, p(x given x, c) | [`model::latent::Prior`], [`model::latent::Encoder`], [`model::latent::Decoder`] | zig-zag | `kappa` |
 #![warn(missing_docs)]
 pub mod model;
+pub mod restart;
 pub mod serve;
 pub mod train;

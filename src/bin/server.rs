@@ -1,9 +1,12 @@
 //! `ada-server`: flags -> config -> serve.
 
-use ada_diffuser::serve::{Server, config::Config, telemetry};
+use ada_diffuser::{
+    restart,
+    serve::{Server, config::Config, telemetry},
+};
 use anyhow::Context;
 use clap::Parser;
-use std::{env, net::SocketAddr, os::unix::process::CommandExt, path::PathBuf, process::Command};
+use std::{net::SocketAddr, path::PathBuf};
 use tokio::signal::unix::{SignalKind, signal};
 
 /// Serves Ada-Diffuser models over gRPC and REST on one port.
@@ -48,7 +51,9 @@ impl Flags {
 
 fn main() -> anyhow::Result<()> {
     let flags = Flags::parse();
-    run_single_threaded_math();
+    if let Err(error) = restart::with_environment(&restart::ONE_THREAD_EACH) {
+        eprintln!("warning: could not start anew with one thread for each product ({error}); serving will be slower");
+    }
     let (file, settings) = flags.settings();
     let config = Config::load(file.as_deref(), &settings)?;
     telemetry::install_log(&config.telemetry);
@@ -62,20 +67,6 @@ fn main() -> anyhow::Result<()> {
     // Whatever still runs after the hard end of the drain must not keep the process.
     runtime.shutdown_background();
     served
-}
-
-/// Each engine thread runs its batch alone, so the math library must not start threads of its own; and it reads /proc/cpuinfo at every matrix product
-/// unless told how many threads there are. It is told by the environment, which a process cannot safely change for itself: so the process is replaced by
-/// itself (same id, same arguments) with the variables set.
-fn run_single_threaded_math() {
-    const ALONE: [(&str, &str); 2] = [("RAYON_NUM_THREADS", "1"), ("CANDLE_NUM_THREADS", "1")];
-    if ALONE.iter().all(|(name, _)| env::var_os(name).is_some()) {
-        return;
-    }
-    let Ok(program) = env::current_exe() else { return };
-    let unset = ALONE.into_iter().filter(|(name, _)| env::var_os(name).is_none());
-    let error = Command::new(program).args(env::args_os().skip(1)).envs(unset).exec();
-    eprintln!("warning: could not restart with single-threaded math ({error}); serving will be slower");
 }
 
 /// Ready at the first SIGTERM or SIGINT; a second one ends the process at once.

@@ -1,4 +1,5 @@
 //! `ada-trainer`: flags -> recipe -> `train::run`.
+use ada_diffuser::restart;
 use ada_diffuser::train::{
     self, Options, Outcome,
     flags::{Cli, Inspect, Probe, Run},
@@ -8,22 +9,10 @@ use ada_diffuser::train::{
 };
 use anyhow::{Context, Result, anyhow};
 use clap::Parser;
-use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
-use std::process::{Command, ExitCode};
+use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::{env, sync::Arc, thread, time::SystemTime};
-
-/// What the libraries read once, before main could set it safely, unless the caller has set it. Threads: the trainer has its own, one
-/// operation each. Memory: a step asks for the same large blocks as the one before; given back in between, each would be cleared by the
-/// system anew (a quarter of a step of the DiT).
-const ENVIRONMENT: [(&str, &str); 5] = [
-    ("RAYON_NUM_THREADS", "1"),
-    ("CANDLE_NUM_THREADS", "1"),
-    ("MALLOC_MMAP_THRESHOLD_", "1073741824"),
-    ("MALLOC_TRIM_THRESHOLD_", "4294967296"),
-    ("MALLOC_TOP_PAD_", "67108864"),
-];
+use std::{sync::Arc, thread, time::SystemTime};
 
 fn main() -> ExitCode {
     start(Cli::parse()).unwrap_or_else(|error| {
@@ -33,11 +22,7 @@ fn main() -> ExitCode {
 }
 
 fn start(cli: Cli) -> Result<ExitCode> {
-    let mut unset = ENVIRONMENT.iter().copied().filter(|(name, _)| env::var_os(name).is_none()).peekable();
-    if unset.peek().is_some() {
-        let vars: Vec<_> = unset.collect();
-        return Err(Command::new(env::current_exe()?).args(env::args_os().skip(1)).envs(vars).exec()).context("cannot start itself anew");
-    }
+    restart::with_environment(&[&restart::ONE_THREAD_EACH[..], &restart::KEEP_MEMORY].concat()).context("cannot start itself anew")?;
     let worker = thread::Builder::new().stack_size(parallel::STACK_BYTES).spawn(|| match cli {
         Cli::Run(flags) => run(flags),
         Cli::Probe(flags) => probe(&flags),

@@ -3,7 +3,12 @@
 //! safetensors itself accepts NaN, flipped bits and an 88 MB header, so everything is checked against the manifest, and the networks
 //! must ask for exactly the tensors that are there.
 
-use crate::model::{Networks, agent::Agent, config::ModelConfig, nn::params::Params};
+use crate::model::{
+    Networks,
+    agent::Agent,
+    config::ModelConfig,
+    nn::{Params, Precision},
+};
 use candle_core::{Device, Tensor};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
@@ -105,6 +110,14 @@ pub fn save(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>
 /// # Errors
 /// If a file is missing, a digest differs, a tensor is missing, superfluous, of another shape, or not finite.
 pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
+    load_as(dir, Precision::F32)
+}
+
+/// The same, with weight matrices held with this precision; the digest stays that of the files.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_as(dir: &Path, precision: Precision) -> Result<Agent, CheckpointError> {
     let (manifest, digest) = load_manifest(dir)?;
     let config: ModelConfig = parse(&dir.join(CONFIG), &read(&dir.join(CONFIG), HEADER_BYTES_MAX)?, &manifest)?;
     config.check().map_err(|reason| invalid(&dir.join(CONFIG), reason))?;
@@ -112,7 +125,7 @@ pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
     let weights = read(&path, WEIGHT_BYTES_MAX)?;
     check_digest(&path, &weights, &manifest)?;
     let tensors = read_tensors(&weights, &manifest).map_err(|reason| invalid(&path, reason))?;
-    let params = Params::loaded(tensors);
+    let params = Params::loaded_as(tensors, precision);
     let networks = Networks::new(&config, &params).map_err(|error| invalid(&path, error.to_string()))?;
     if let Some(name) = params.unused().first() {
         return Err(invalid(&path, format!("tensor {name} belongs to no network of {CONFIG}")));

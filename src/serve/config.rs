@@ -1,5 +1,6 @@
 //! Every setting of the server, read once: file, then environment (`ADA__SECTION__KEY`), then flags; `deploy/server.toml` lists them all.
 
+use crate::model::nn::Precision;
 use config::{Environment, File, FileFormat};
 use serde::{Deserialize, Serialize};
 use std::{net::SocketAddr, path::Path, path::PathBuf, thread};
@@ -133,6 +134,8 @@ pub struct ModelsConfig {
     pub dir: PathBuf,
     /// Model of a client that names none; it must be there.
     pub default: String,
+    /// How weight matrices are held. `bf16` takes half the memory and moves answers by about a thousandth.
+    pub weights: Precision,
 }
 
 /// What is logged.
@@ -227,7 +230,7 @@ impl Default for EngineConfig {
 
 impl Default for ModelsConfig {
     fn default() -> Self {
-        Self { dir: PathBuf::from("models"), default: "cheetah-wind-s".to_owned() }
+        Self { dir: PathBuf::from("models"), default: "cheetah-wind-s".to_owned(), weights: Precision::F32 }
     }
 }
 

@@ -1,7 +1,7 @@
 //! The loaded models, by name.
 
 use crate::{
-    model::{agent::Agent, checkpoint},
+    model::{agent::Agent, checkpoint, nn::Precision},
     serve::{config::ModelsConfig, error::ServiceError},
 };
 use std::{collections::BTreeMap, fs, io, path::Path, path::PathBuf, sync::Arc, time::Instant};
@@ -61,7 +61,7 @@ impl Registry {
     /// If the directory cannot be read, or no checkpoint or not the default one could be loaded.
     pub fn load(config: &ModelsConfig) -> Result<Self, RegistryError> {
         let dirs = checkpoint_dirs(&config.dir).map_err(|source| RegistryError::Dir { dir: config.dir.clone(), source })?;
-        let loaded = dirs.iter().filter_map(|(name, dir)| load_one(name, dir)).map(|(name, agent)| {
+        let loaded = dirs.iter().filter_map(|(name, dir)| load_one(name, dir, config.weights)).map(|(name, agent)| {
             let is_default = *name == *config.default;
             (name.clone(), Model { name, agent, is_default })
         });
@@ -120,9 +120,9 @@ fn is_name(name: &str) -> bool {
     (1..=NAME_LEN_MAX).contains(&name.len()) && name.chars().all(allowed)
 }
 
-fn load_one(name: &Arc<str>, dir: &Path) -> Option<(Arc<str>, Arc<Agent>)> {
+fn load_one(name: &Arc<str>, dir: &Path, weights: Precision) -> Option<(Arc<str>, Arc<Agent>)> {
     let begin = Instant::now();
-    match checkpoint::load(dir) {
+    match checkpoint::load_as(dir, weights) {
         Ok(agent) => {
             let digest = agent.spec().digest.clone();
             metrics::histogram!("ada_model_load_duration_seconds").record(begin.elapsed().as_secs_f64());

@@ -100,9 +100,6 @@ pub struct Adam {
 
 impl Adam {
     /// Zero moments; `group` sorts names into groups.
-    ///
-    /// # Errors
-    /// If a variable is not f32.
     pub fn new(vars: &BTreeMap<String, Var>, group: impl Fn(&str) -> usize, weight_decay: f64, clip_norm: f64) -> Self {
         let slot = |(name, var): (&String, &Var)| {
             let zeros = || vec![0.0; var.elem_count()];

@@ -3,7 +3,7 @@
 
 use ada_diffuser::model::{
     Networks,
-    agent::{Agent, Descent, Episode, LatentMode, Observation, SamplerOptions},
+    agent::{Agent, Descent, Episode, LatentMode, Observation, SamplerOptions, Start},
     config::{ModelConfig, Restart},
     denoiser::DenoiserConfig,
     latent::LatentConfig,
@@ -45,15 +45,16 @@ fn asked_during(work: impl FnOnce()) -> usize {
 
 fn agent(denoiser: DenoiserConfig, obs_horizon: usize) -> Agent {
     let plain = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, Some(LatentConfig { dim: 5, hidden: 16 }), denoiser);
-    let never = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
-    let config = ModelConfig { obs_horizon, restart: never, ..plain };
+    // Every warm act is noised again a little.
+    let restart = Restart { renoise_distance: 0.0, cold_distance: 1e7, latent_jump: f32::INFINITY };
+    let config = ModelConfig { obs_horizon, restart, ..plain };
     let fresh = Params::fresh(1);
     Networks::new(&config, &fresh).unwrap();
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
     Agent::new(config.clone(), Networks::new(&config, &Params::loaded(tensors)).unwrap(), "test".into())
 }
 
-/// Acts of a batch of streaming and cold sessions: all evaluations, those with refinement, renoising and draws among them.
+/// The next acts of a batch of sessions.
 fn descents(agent: &Agent, episodes: &[Episode]) -> Vec<Descent> {
     let observation = Observation { state: vec![0.3, -0.2, 0.1], executed: Vec::new() };
     episodes.iter().map(|episode| agent.begin(episode, &observation).unwrap()).collect()
@@ -80,7 +81,12 @@ fn a_tick_allocates_nothing() {
             streaming: !i.is_multiple_of(4),
             ..SamplerOptions::default()
         };
-        let episodes: Vec<Episode> = (0..9).map(|i| agent.open(i, &options(i)).unwrap()).collect();
+        let opened: Vec<Episode> = (0..9).map(|i| agent.open(i, &options(i)).unwrap()).collect();
+        // Streaming sessions have a window to noise again, the others start cold.
+        let observation = Observation { state: vec![0.1, 0.2, 0.3], executed: Vec::new() };
+        let episodes: Vec<Episode> = opened.iter().map(|episode| agent.act(episode, &observation).unwrap().0).collect();
+        let starts: Vec<Start> = episodes.iter().map(|episode| agent.act(episode, &observation).unwrap().1.start).collect();
+        assert!(starts.contains(&Start::Cold) && starts.contains(&Start::Renoised(2)), "{starts:?}");
         go_down(&agent, &mut descents(&agent, &episodes));
         let mut again = descents(&agent, &episodes);
         assert!(asked_during(|| drop(descents(&agent, &episodes))) > 0, "the counter counts");

@@ -3,7 +3,7 @@
 use super::*;
 use crate::model::{
     latent::LatentConfig,
-    nn::{Buffer, Precision},
+    nn::{Buffer, Precision, kernels::testing::with_each_isa},
     noise::Philox,
     trajectory::Layout,
 };
@@ -94,14 +94,17 @@ fn bf16_weights_are_near() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
-    /// A row's bits are its own, whatever the batch, its place there, and how its weights are held.
+    /// A row's bits are its own, whatever the batch, its place there, the processor's instructions, and how weights are held.
     #[test]
     fn a_row_does_not_depend_on_its_batch(seeds in proptest::collection::vec(0_u64..1000, 1..40), unet: bool, half: bool) {
         let denoiser = denoiser(backbones()[usize::from(!unet)].clone(), if half { Precision::Bf16 } else { Precision::F32 });
         let windows: Vec<Window> = seeds.into_iter().map(window).collect();
         let together = predict::<Buffer>(&denoiser, &windows);
+        // Alone, and with every instruction set.
         for (window, row) in windows.iter().zip(together.chunks_exact(LEN * 5)) {
-            prop_assert_eq!(bits(&predict::<Buffer>(&denoiser, std::slice::from_ref(window))), bits(row));
+            for alone in with_each_isa(|_| predict::<Buffer>(&denoiser, std::slice::from_ref(window))) {
+                prop_assert_eq!(bits(&alone), bits(row));
+            }
         }
     }
 }

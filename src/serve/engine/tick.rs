@@ -43,8 +43,6 @@ struct Rider<T> {
     ticket: T,
     submitted: Instant,
     started: Instant,
-    /// Evaluations spent on it, to count what is wasted if it is dropped.
-    evaluations: u64,
 }
 
 impl<T: Ticket> Batch<T> {
@@ -74,7 +72,7 @@ impl<T: Ticket> Batch<T> {
         ticket.start();
         let group = self.group(agent);
         group.descents.push(descent);
-        group.riders.push(Rider { question, ticket, submitted, started: Instant::now(), evaluations: 0 });
+        group.riders.push(Rider { question, ticket, submitted, started: Instant::now() });
     }
 
     /// One evaluation for every act; those that are done leave.
@@ -128,9 +126,6 @@ impl<T: Ticket> Group<T> {
         if self.costs.is_some() {
             slowness.note(begin.elapsed(), expected);
         }
-        for rider in &mut self.riders {
-            rider.evaluations += 1;
-        }
         self.harvest();
     }
 
@@ -159,8 +154,8 @@ impl<T: Ticket> Group<T> {
     fn drop_unwanted(&mut self) {
         for i in (0..self.riders.len()).rev() {
             if !self.riders[i].ticket.is_wanted() {
-                self.descents.swap_remove(i);
-                self.riders.swap_remove(i).count_waste();
+                self.riders.swap_remove(i);
+                count_waste(&self.descents.swap_remove(i));
             }
         }
     }
@@ -194,21 +189,20 @@ impl<T: Ticket> Rider<T> {
     }
 
     /// The whole act without batch mates, from the beginning: the result is the same, for noise does not depend on the batch.
-    fn ride_alone(mut self, agent: &Agent, costs: Option<&Costs>, pace: Pace) {
+    fn ride_alone(self, agent: &Agent, costs: Option<&Costs>, pace: Pace) {
         let mut descent = match guarded(|| self.question.begin(agent)) {
             Ok(descent) => descent,
             Err(failure) => return self.ticket.settle(Err(failure)),
         };
         while !descent.is_done() {
             if !self.ticket.is_wanted() {
-                return self.count_waste();
+                return count_waste(&descent);
             }
             let hurried = costs.map_or(Ok(false), |costs| self.hurry(agent, &mut descent, (costs, 1, 1.0), pace));
             let advanced = hurried.and_then(|cut| if cut { Ok(()) } else { guarded(|| agent.advance(std::slice::from_mut(&mut descent))) });
             if let Err(failure) = advanced {
                 return self.ticket.settle(Err(failure));
             }
-            self.evaluations += 1;
         }
         self.settle(guarded(|| agent.finish(descent)));
     }
@@ -221,10 +215,10 @@ impl<T: Ticket> Rider<T> {
         }
         self.ticket.settle(finished.map(|(episode, chunk)| Finished { episode, chunk, queue, compute, at }));
     }
+}
 
-    fn count_waste(self) {
-        metrics::counter!("ada_wasted_network_evaluations_total").increment(self.evaluations);
-    }
+fn count_waste(descent: &Descent) {
+    metrics::counter!("ada_wasted_network_evaluations_total").increment(descent.evaluations().into());
 }
 
 /// Runs a piece of the model; a panic is a failure of the act, not of the thread. What it touched is dropped, so no broken state is seen again.
