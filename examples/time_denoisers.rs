@@ -9,7 +9,7 @@ use ada_diffuser::model::{
     config::ModelConfig,
     denoiser::{Condition, Denoiser, DenoiserConfig},
     latent::LatentConfig,
-    nn::{Activation, Buffer, GroupNormMish, Gru, LayerNorm, Params, Value, conv1d::ConvLayer},
+    nn::{Activation, Buffer, GroupNormMish, Gru, LayerNorm, Params, Precision, Value, conv1d::ConvLayer},
     noise::Philox,
     trajectory::Layout,
 };
@@ -51,6 +51,9 @@ struct Flags {
     /// What is timed.
     #[arg(long, value_enum, default_value = "forward")]
     what: What,
+    /// How weights are held (forward and bound).
+    #[arg(long, value_enum, default_value = "f32")]
+    weights: Weights,
     /// For so long.
     #[arg(long, default_value_t = 2.0)]
     seconds: f64,
@@ -60,6 +63,12 @@ struct Flags {
 enum Net {
     Unet,
     Dit,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Weights {
+    F32,
+    Bf16,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -107,15 +116,16 @@ fn config(flags: &Flags) -> ModelConfig {
 }
 
 /// The networks as a server has them: weights constant and packed once.
-fn frozen(config: &ModelConfig) -> anyhow::Result<Networks> {
+fn frozen(config: &ModelConfig, weights: Weights) -> anyhow::Result<Networks> {
     let fresh = Params::fresh(0);
     Networks::new(config, &fresh)?;
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
-    Ok(Networks::new(config, &Params::loaded(tensors))?)
+    let precision = if matches!(weights, Weights::Bf16) { Precision::Bf16 } else { Precision::F32 };
+    Ok(Networks::new(config, &Params::loaded_as(tensors, precision))?)
 }
 
 fn forward<V: Value>(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
-    let networks = frozen(config)?;
+    let networks = frozen(config, flags.weights)?;
     let shape = (flags.batch.div_ceil(flags.threads), flags.len);
     let alone = median(rounds::<V>(&networks.denoiser, shape, &Barrier::new(1), 10)?);
     let (count, meet) = ((flags.seconds * 1e3 / alone) as usize + 10, Barrier::new(flags.threads));
