@@ -126,8 +126,8 @@ impl CustomOp2 for Modulate {
     fn bwd(&self, x: &Tensor, ada: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Grads2> {
         let grad = grad.contiguous()?;
         let (_, _, channels) = x.dims3()?;
-        let (mut dx, mut d_ada) = (values(&grad)?.to_vec(), vec![0.0; ada.elem_count()]);
-        join::modulate_back(&values(x)?, &mut dx, &values(ada)?, &mut d_ada, channels);
+        let mut dx = values(&grad)?.to_vec();
+        let d_ada = join::modulate_back(&values(x)?, &mut dx, &values(ada)?, channels);
         Ok((grad_like(dx, x)?, grad_like(d_ada, ada)?))
     }
 }

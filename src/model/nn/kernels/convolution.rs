@@ -10,7 +10,7 @@
 use super::{
     join,
     pool::Pooled,
-    product::{InLine, Left, Packed, Passes, Precision, Row, Start, Table, even_rows, product},
+    product::{Every, InLine, Left, Packed, Passes, Precision, Row, Start, Table, even_rows, product},
 };
 use std::ops::Range;
 
@@ -164,6 +164,13 @@ impl Convolution {
     pub fn weight_grad(&self, x: &[f32], dy: &[f32]) -> Vec<f32> {
         let ConvShape { c_in, c_out, kernel, stride, padding } = self.shape;
         let (batch, steps, narrow_steps) = (self.batch, self.padded_steps(), self.narrow_steps);
+        if self.shape.is_pointwise() {
+            // Without taps the product can be taken the other way round, which gives the weights' own layout.
+            let (count, mut out) = (batch * narrow_steps, vec![0.0; c_out * c_in]);
+            let packed = Packed::scratch(x, (Every(c_in), count), (c_in, 1));
+            product(Left { values: dy, terms: Every(c_out) }, &packed, Start::Zero, &mut out, even_rows(c_out, 1, c_in, count));
+            return out;
+        }
         let by_time = |window: usize, step: usize| -> Vec<usize> {
             (0..narrow_steps).flat_map(|t| (0..batch).map(move |b| b * window + t * step)).collect()
         };

@@ -2,6 +2,7 @@
 
 use super::{
     per_isa,
+    pool::Pooled,
     transpose::{self, SIDE},
 };
 
@@ -55,18 +56,16 @@ per_isa! {
 }
 
 per_isa! {
-    /// Gradients of [`modulate`]: `dx` holds that of the result and becomes that of `x`; `d_ada` takes those of shift and scale.
-    pub fn modulate_back(x: &[f32], dx: &mut [f32], ada: &[f32], d_ada: &mut [f32], channels: usize) {
+    /// Gradients of [`modulate`]: `dx` holds that of the result and becomes that of `x`; those of shift and scale are returned.
+    pub fn modulate_back(x: &[f32], dx: &mut [f32], ada: &[f32], channels: usize) -> Vec<f32> {
+        let mut d_ada = Vec::with_capacity(ada.len());
         let rows = x.chunks_exact(channels).zip(dx.chunks_exact_mut(channels));
-        for ((x, dx), (ada, d_ada)) in rows.zip(ada.chunks_exact(2 * channels).zip(d_ada.chunks_exact_mut(2 * channels))) {
-            let (d_shift, d_scale) = d_ada.split_at_mut(channels);
-            d_shift.copy_from_slice(dx);
-            let columns = x.iter().zip(dx.iter_mut()).zip(ada[channels..].iter().zip(d_scale));
-            for ((x, dx), (scale, d_scale)) in columns {
-                *d_scale = x * *dx;
-                *dx *= scale + 1.0;
-            }
+        for ((x, dx), ada) in rows.zip(ada.chunks_exact(2 * channels)) {
+            d_ada.extend_from_slice(dx);
+            d_ada.extend(x.iter().zip(&*dx).map(|(x, dx)| x * dx));
+            dx.iter_mut().zip(&ada[channels..]).for_each(|(dx, scale)| *dx *= scale + 1.0);
         }
+        d_ada
     }
 }
 
@@ -91,15 +90,16 @@ pub fn split(joined: &[f32], widths: [usize; 2]) -> [Vec<f32>; 2] {
 /// The rows of a matrix of `columns` columns, in the given order, as columns; block by block.
 pub fn transpose(matrix: &[f32], columns: usize, order: &[usize]) -> Vec<f32> {
     let rows = order.len();
-    let mut out = vec![0.0; matrix.len()];
+    let (mut out, mut strip) = (Vec::with_capacity(matrix.len()), Pooled::take(SIDE * rows));
     for column in (0..columns).step_by(SIDE) {
         let width = SIDE.min(columns - column);
         for (start, order) in order.chunks(SIDE).enumerate() {
             let block = transpose::transpose(&transpose::gather(order.len(), width, |i| &matrix[order[i] * columns + column..]));
-            for (j, turned) in block[..width].iter().enumerate() {
-                out[(column + j) * rows + start * SIDE..][..order.len()].copy_from_slice(&turned[..order.len()]);
+            for (turned, strip) in block[..width].iter().zip(strip.chunks_exact_mut(rows)) {
+                strip[start * SIDE..][..order.len()].copy_from_slice(&turned[..order.len()]);
             }
         }
+        out.extend_from_slice(&strip[..width * rows]);
     }
     out
 }
