@@ -40,7 +40,7 @@ pub trait Value: Clone {
     /// If shapes differ.
     fn gru(&self, layer: &Gru, before: Option<&Self>) -> Result<Self>;
 
-    /// See [`attention`].
+    /// Multi-head self-attention of q, k, v side by side: `(batch, steps, 3 width)` to `(batch, steps, width)`.
     ///
     /// # Errors
     /// If the channels are not q, k, v of `heads` heads.

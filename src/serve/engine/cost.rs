@@ -5,6 +5,8 @@ use std::time::{Duration, Instant};
 
 /// Descents of each length that are timed, and their ticks; the fastest counts, for the first ones find no memory yet.
 const ROUNDS: usize = 3;
+/// A tick that takes this long is timed once: its memory is the least of it, and a large model must get ready in time too.
+const LONG: Duration = Duration::from_millis(20);
 /// Weight of the newest tick in what the worker knows of its slowness.
 const NEWEST: f64 = 0.1;
 /// One tick counts as no slower than this: a hiccup of the machine is no reason to hurry for long.
@@ -31,6 +33,9 @@ impl Costs {
                 descents.retain(|descent| !descent.is_done());
                 // Where one evaluation makes a whole act, every tick is a first one.
                 tick = if descents.len() == len { tick.min(timed(|| agent.advance(&mut descents))?) } else { start };
+                if tick > LONG {
+                    break;
+                }
             }
             costs.ticks.push(tick);
             costs.starts.push(start.saturating_sub(tick));
