@@ -286,7 +286,8 @@ fn run_once(agent: &Agent, options: &SamplerOptions) -> Chunk {
 fn an_allowance_makes_larger_jumps() {
     let agent = agent(true, 1, unet());
     let unrefined = |options: &SamplerOptions| run_once(&agent, &SamplerOptions { kappa: 0.0, ..options.clone() }).latent_mean;
-    for (allowance, action_horizon, sub_steps) in [(1, 1, 1), (3, 1, 1), (5, 1, 3), (4, 3, 2), (7, 3, 1), (9, 2, 1), (100, 3, 2)] {
+    for (allowance, action_horizon, sub_steps) in [(1, 1, 1), (3, 1, 1), (5, 1, 3), (6, 1, 3), (4, 3, 2), (7, 3, 1), (9, 2, 1), (100, 3, 2)]
+    {
         let options = SamplerOptions { action_horizon, sub_steps, ..options() };
         let (episode, observation) = (agent.open(1, &options).unwrap(), observation(&mut Philox::new(1)));
         let mut descents = [agent.begin(&episode, &observation).unwrap()];

@@ -76,3 +76,6 @@ impl LatentModel {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests;

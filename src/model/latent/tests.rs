@@ -1,0 +1,66 @@
+//! The latent networks on both kinds of values.
+
+use super::*;
+use crate::model::{
+    nn::{Buffer, Precision},
+    noise::Philox,
+    trajectory::Token,
+};
+use candle_core::Tensor;
+
+const LAYOUT: Layout = Layout { state_dim: 3, action_dim: 2 };
+const LEN: usize = 5;
+
+fn model() -> LatentModel {
+    let (config, fresh) = (LatentConfig { dim: 6, hidden: 24 }, Params::fresh(4));
+    LatentModel::new(&config, LAYOUT, &fresh).unwrap();
+    let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
+    LatentModel::new(&config, LAYOUT, &Params::loaded_as(tensors, Precision::F32)).unwrap()
+}
+
+/// Tokens of which this and that is missing.
+fn rows() -> Vec<Vec<Token>> {
+    let mut stream = Philox::new(8);
+    let mut token = |i: usize| Token {
+        state: (!i.is_multiple_of(3)).then(|| (0..3).map(|_| stream.normal()).collect()),
+        action: i.is_multiple_of(2).then(|| vec![0.3, -0.1 * i as f32]),
+        reward: (i % 5 > 1).then_some(0.2 * i as f32),
+        noise: 0.1 * (i % 4) as f32,
+    };
+    (0..7).map(|row| (0..LEN).map(|position| token(row * 3 + position)).collect()).collect()
+}
+
+/// Posterior, and mean and log-variance of the prior chain after it.
+fn chain<V: Value>(model: &LatentModel, rows: &[Vec<Token>], numbers: impl Fn(&V) -> Vec<f32>) -> Vec<u32> {
+    let tokens = Tokens::<V>::pack(LAYOUT, rows.iter(), LEN, |row, position| row[position].view()).unwrap();
+    let posterior = model.infer(&tokens).unwrap();
+    let mut all = [numbers(&posterior.mean), numbers(&posterior.log_var)].concat();
+    let keep = |next: &Gaussian<V>| {
+        all.extend([numbers(&next.mean), numbers(&next.log_var)].concat());
+        Ok(())
+    };
+    model.roll_out(posterior, 3, keep).unwrap();
+    all.into_iter().map(f32::to_bits).collect()
+}
+
+fn on_buffers(model: &LatentModel, rows: &[Vec<Token>]) -> Vec<u32> {
+    chain(model, rows, |buffer: &Buffer| buffer.to_vec())
+}
+
+#[test]
+fn tensors_and_buffers_give_the_same_bits() {
+    let (model, rows) = (model(), rows());
+    let tensors = chain(&model, &rows, |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1().unwrap());
+    assert_eq!(tensors, on_buffers(&model, &rows));
+}
+
+#[test]
+fn a_row_does_not_depend_on_its_batch() {
+    let (model, rows) = (model(), rows());
+    let together = on_buffers(&model, &rows);
+    for (i, row) in rows.iter().enumerate() {
+        let alone = on_buffers(&model, std::slice::from_ref(row));
+        let parts = together.chunks_exact(rows.len() * 6).flat_map(|part| part[i * 6..][..6].iter().copied());
+        assert_eq!(alone, parts.collect::<Vec<_>>(), "row {i}");
+    }
+}
