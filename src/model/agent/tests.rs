@@ -309,6 +309,23 @@ fn an_allowance_makes_larger_jumps() {
     }
 }
 
+/// With several rows a rung, a jump that would pass READY by ends there, if an evaluation is left.
+#[test]
+fn a_jump_ends_at_ready() {
+    let agent = agent(true, 1, unet());
+    let episode = agent.open(1, &SamplerOptions { sub_steps: 3, ..options() }).unwrap();
+    let ready = Ladder::new(HORIZON, 3, 40).unwrap().ready();
+    for (allowance, row) in [(2, ready), (1, ready - 1 + 4)] {
+        let mut descents = [agent.begin(&episode, &observation(&mut Philox::new(1))).unwrap()];
+        agent.advance(&mut descents).unwrap();
+        descents[0].row = ready - 1;
+        descents[0].allow(Some(allowance));
+        agent.advance(&mut descents).unwrap();
+        // What passes READY by is emitted, and stands at READY with the next position.
+        assert_eq!((descents[0].row, descents[0].is_done()), (ready, row > ready));
+    }
+}
+
 /// Without time for an evaluation, the window of the act before gives its next actions as they stand, within bounds and with the latent
 /// of the act before; each time it stands one rung higher on the ladder, and an act with time goes on from there.
 #[test]

@@ -279,11 +279,13 @@ async fn a_deadline_gets_a_degraded_answer() {
     let id = server.open(json!({"model": "slow"})).await;
     let grpc = server.agent().await.act(pb::ActRequest { deadline_ms: Some(500), ..act(&id, 1, &STATE) }).await.unwrap().into_inner();
     assert!(grpc.degraded);
-    // One who has time decides for all who wait.
+    // One who joins and has time decides for all who wait.
     let id = server.open(json!({"model": "slow"})).await;
+    let (mut agent, request) = (server.agent().await, pb::ActRequest { deadline_ms: Some(1_500), ..act(&id, 1, &STATE) });
+    let hasty = tokio::spawn(async move { agent.act(request).await });
+    server.until(&id, |session| session["busy"] == true).await;
     let patient = server.start_slow(&id).await;
-    let hasty = server.agent().await.act(pb::ActRequest { deadline_ms: Some(300), ..act(&id, 1, &STATE) }).await.unwrap_err();
-    assert_eq!(failure(&hasty), (Code::DeadlineExceeded, "DEADLINE_COMPUTE".into()));
+    assert_eq!(failure(&hasty.await.unwrap().unwrap_err()), (Code::DeadlineExceeded, "DEADLINE_COMPUTE".into()));
     patient.abort();
     let id = server.open(json!({"model": "tiny"})).await;
     let grpc = server.agent().await.act(pb::ActRequest { deadline_ms: Some(20_000), ..act(&id, 1, &STATE) }).await.unwrap().into_inner();
