@@ -84,6 +84,8 @@ enum What {
 
 fn main() -> anyhow::Result<()> {
     let flags = Flags::parse();
+    let shared = flags.threads > 0 && flags.batch > 0 && flags.batch.is_multiple_of(flags.threads);
+    anyhow::ensure!(shared, "--batch {} cannot be shared by --threads {}", flags.batch, flags.threads);
     // As the trainer does.
     restart::with_environment(&[&restart::ONE_THREAD_EACH[..], &restart::KEEP_MEMORY].concat())?;
     let config = config(&flags);

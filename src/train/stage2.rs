@@ -14,6 +14,7 @@ use crate::model::{
 };
 use anyhow::Result;
 use candle_core::backprop::GradStore;
+use std::ops::Range;
 
 /// Seed of the held-out batches: the same for all runs, so that their errors can be compared.
 const HELD_OUT_SEED: u64 = 0xE7A1;
@@ -73,7 +74,7 @@ impl<'a> RefineTask<'a> {
         let elbo = elbo.map(|(elbo, stage1)| Ok::<_, anyhow::Error>((elbo, elbo.batch(&mut rng)?, stage1.kl_weight.end))).transpose()?;
         let (networks, weight) = (&learner.networks, stage.elbo_weight);
         let mut jobs: Vec<Box<dyn FnOnce() -> Result<Part> + Send>> = Vec::new();
-        for shard in 0..SHARDS {
+        for shard in shards(batch.rows.len()) {
             let batch = &batch;
             jobs.push(Box::new(move || self.shard(networks, batch, shard)));
         }
@@ -101,11 +102,9 @@ impl<'a> RefineTask<'a> {
     }
 
     /// Loss and gradients of one shard of a batch, weighted by its share.
-    fn shard(&self, networks: &Networks, batch: &WindowBatch, shard: usize) -> Result<Part> {
-        let count = batch.rows.len();
-        let (start, end) = (shard * count / SHARDS, (shard + 1) * count / SHARDS);
-        let terms = networks.refine_loss(&self.task.config, &batch.narrow(start, end - start)?, &self.options)?;
-        let loss = terms.loss.affine((end - start) as f64 / count as f64, 0.0)?;
+    fn shard(&self, networks: &Networks, batch: &WindowBatch, shard: Range<usize>) -> Result<Part> {
+        let terms = networks.refine_loss(&self.task.config, &batch.narrow(shard.start, shard.len())?, &self.options)?;
+        let loss = terms.loss.affine(shard.len() as f64 / batch.rows.len() as f64, 0.0)?;
         let sums = [terms.prior, terms.posterior].map(|(mean, count)| (f64::from(mean) * count as f64, count));
         Ok(Part { grads: loss.backward()?, sums, loss: f64::from(loss.to_scalar::<f32>()?), scalars: Vec::new() })
     }
@@ -123,5 +122,23 @@ impl<'a> RefineTask<'a> {
             Ok(f64::from(networks.refine_loss(&self.task.config, &batch, &self.options)?.loss.to_scalar::<f32>()?))
         };
         (0..rows).map(error).collect()
+    }
+}
+
+/// The windows of each shard; a batch of fewer windows than shards has fewer shards, none of them empty.
+fn shards(count: usize) -> impl Iterator<Item = Range<usize>> {
+    let all = (0..SHARDS).map(move |shard| shard * count / SHARDS..(shard + 1) * count / SHARDS);
+    all.filter(|shard| !shard.is_empty())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shards_hold_every_window_once() {
+        let ends = |count| shards(count).map(|shard| (shard.start, shard.end)).collect::<Vec<_>>();
+        assert_eq!(ends(1), [(0, 1)]);
+        assert_eq!(ends(5), [(0, 2), (2, 5)]);
     }
 }

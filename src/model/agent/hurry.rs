@@ -50,7 +50,8 @@ impl Descent {
             let others = (self.actions_left() - 1) * self.ladder.rung().div_ceil(rows);
             above.div_ceil(rows) + below.div_ceil(rows) + others
         };
-        match (1..=above.max(below)).find(|&rows| needed(rows) <= allowance) {
+        let least = (above + below).div_ceil(allowance);
+        match (least..=above.max(below)).find(|&rows| needed(rows) <= allowance) {
             Some(rows) => rows.min(if above > 0 { above } else { below }),
             None => above + below,
         }

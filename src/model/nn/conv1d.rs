@@ -72,8 +72,8 @@ impl ConvTranspose1d {
 /// Weight, bias and the operation of a convolution, a transposed one, or a linear layer.
 #[derive(Clone, Debug)]
 pub struct ConvLayer {
-    pub(super) weight: Tensor,
-    pub(super) bias: Tensor,
+    weight: Tensor,
+    bias: Tensor,
     op: ConvOp,
 }
 
@@ -172,7 +172,7 @@ impl ConvOp {
         if channels != c_in {
             candle_core::bail!("a layer of {c_in} input channels got {channels}");
         }
-        if (kernel, stride, padding) == (1, 1, 0) {
+        if shape.is_pointwise() {
             return Ok(Plan { work: Convolution { shape, batch: 1, wide_steps: batch * steps, narrow_steps: batch * steps }, steps });
         }
         let result = if self.transposed {
@@ -190,7 +190,7 @@ impl ConvOp {
         let Some((&channels, leading)) = x.dims().split_last() else { candle_core::bail!("a layer got a scalar") };
         match leading {
             [batch, steps] => Ok([*batch, *steps, channels]),
-            _ if self.shape.kernel == 1 => Ok([1, leading.iter().product(), channels]),
+            _ if self.shape.is_pointwise() => Ok([1, leading.iter().product(), channels]),
             _ => candle_core::bail!("a convolution takes (batch, steps, channels), got {x:?}"),
         }
     }

@@ -84,7 +84,8 @@ impl ConvShape {
         Phases((0..self.stride).map(phase).collect())
     }
 
-    fn is_pointwise(&self) -> bool {
+    /// Whether it has no kernel over time: a linear layer.
+    pub fn is_pointwise(&self) -> bool {
         self.kernel == 1 && self.stride == 1 && self.padding == 0
     }
 }
