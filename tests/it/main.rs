@@ -4,6 +4,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod allocations;
+mod golden;
 mod laws;
 mod server;
 mod trainer;
