@@ -38,6 +38,12 @@ pub struct ModelConfig {
     /// Sub-steps per rung, beside the default's, whose levels stage 2 trained.
     #[serde(default)]
     pub sub_steps_trained: Vec<usize>,
+    /// Actions per chunk, beside the default's, that stage 2 trained: later actions of a chunk start from imagined states.
+    #[serde(default)]
+    pub action_horizons_trained: Vec<usize>,
+    /// Which fields of the history training hid now and then, so that an act may come without them.
+    #[serde(default)]
+    pub missing_trained: Missing,
     /// Whether stage 2 trained the refinement that zig-zag does (section 4.3 of the paper).
     pub refined: bool,
     /// Root mean square spread of the prior's latent mean over the training data (all dimensions pooled): the yardstick of a latent jump.
@@ -47,6 +53,18 @@ pub struct ModelConfig {
     pub restart: Restart,
     /// Sampling defaults.
     pub sampler: SamplerOptions,
+}
+
+/// Fields of the history that may be missing at an act.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Missing {
+    /// States before the current one.
+    pub state: bool,
+    /// Actions.
+    pub action: bool,
+    /// Rewards.
+    pub reward: bool,
 }
 
 /// When a stored window is noised again or thrown away. Distances of states are root mean squares in standard deviations of the data.
@@ -68,7 +86,7 @@ impl Default for Restart {
 }
 
 impl ModelConfig {
-    /// Plain units (no normalization, actions in [-1, 1]) and defaults for everything but the sizes that must be said: where tests,
+    /// Plain units (no normalization, actions in [-1, 1]), every gap and chunk trained, and defaults for everything but the sizes that must be said: where tests,
     /// benches and examples start.
     pub fn plain(layout: Layout, latent: Option<LatentConfig>, denoiser: DenoiserConfig) -> Self {
         Self {
@@ -89,6 +107,8 @@ impl ModelConfig {
                 state_change_std: vec![1.0; layout.state_dim],
             },
             sub_steps_trained: Vec::new(),
+            action_horizons_trained: (1..=8).collect(),
+            missing_trained: Missing { state: true, action: true, reward: true },
             refined: true,
             latent_spread: 1.0,
             restart: Restart::default(),
@@ -127,13 +147,18 @@ impl ModelConfig {
         if [renoise_distance, cold_distance, latent_jump, self.latent_spread].iter().any(|value| value.is_nan() || *value < 0.0) {
             return Err("restart and latent_spread must not be negative or NaN".into());
         }
-        if self.action_low.iter().zip(&self.action_high).any(|(low, high)| low >= high || !low.is_finite() || !high.is_finite()) {
-            return Err("action_low must be below action_high".into());
+        if self.action_low.iter().zip(&self.action_high).any(|(low, high)| low > high || !low.is_finite() || !high.is_finite()) {
+            return Err("action_low must not be above action_high".into());
         }
         if self.plan_horizon == 0 || self.obs_horizon == 0 || self.block_len == 0 || self.state_clip.is_nan() || self.state_clip <= 0.0 {
             return Err("plan_horizon, obs_horizon, block_len and state_clip must be positive".into());
         }
         Ok(())
+    }
+
+    /// Executed actions in the units of the networks, `action_dim` values: held within their bounds, as those of training are.
+    pub fn normalize_action(&self, raw: &[f32]) -> Vec<f32> {
+        self.normalizer.action.normalize_within(raw, &self.action_low, &self.action_high)
     }
 
     /// Bounds a denoised token in place, normalized units: states by `state_clip`, actions by their bounds.

@@ -22,7 +22,10 @@ mod tests;
 
 use crate::model::{config::ModelConfig, diffusion::refine::LatentRouting};
 use anyhow::{Context, Result, bail, ensure};
-use dataset::{Split, hdf5};
+use dataset::{
+    Split, UnitsFrom, hdf5,
+    units::{self, ActionColumn},
+};
 use learner::{Learner, Scalars};
 use log::{Clock, Log};
 use recipe::{Gate, Recipe};
@@ -68,6 +71,8 @@ pub struct Task {
     pub recipe: Recipe,
     /// The data, normalized.
     pub split: Split,
+    /// What was chosen for each column of actions.
+    pub action_columns: Vec<ActionColumn>,
     /// SHA-256 of the data set.
     pub dataset_digest: String,
     /// The architecture, without the latent spread, which only training tells.
@@ -86,7 +91,7 @@ impl Task {
         if recipe.gate.is_some() {
             ensure!(dataset.context_dim > 0, "recipe: `gate`: {} has no `infos/context` to probe for", recipe.data.display());
         }
-        let split = dataset.split(None);
+        let (split, action_columns) = dataset.split(UnitsFrom::Data(&recipe.actions))?;
         let config = ModelConfig {
             layout: dataset.layout,
             plan_horizon: recipe.model.plan_horizon,
@@ -96,16 +101,18 @@ impl Task {
             latent: recipe.model.latent.clone(),
             denoiser: recipe.model.denoiser.clone(),
             state_clip: recipe.model.state_clip,
-            action_low: split.action_bounds.0.clone(),
-            action_high: split.action_bounds.1.clone(),
-            normalizer: split.normalizer.clone(),
-            sub_steps_trained: Vec::new(),
+            action_low: split.units.action_low.clone(),
+            action_high: split.units.action_high.clone(),
+            normalizer: split.units.normalizer.clone(),
+            sub_steps_trained: vec![recipe.sampler.sub_steps],
+            action_horizons_trained: recipe.action_horizons(),
+            missing_trained: recipe.hide.trained(),
             refined: recipe.model.latent.is_some() && recipe.stage2.routing == LatentRouting::Matched,
             latent_spread: 0.0,
             restart: recipe.restart,
             sampler: recipe.sampler.clone(),
         };
-        Ok(Self { recipe, split, dataset_digest: dataset.digest, config })
+        Ok(Self { recipe, split, action_columns, dataset_digest: dataset.digest, config })
     }
 }
 
@@ -127,6 +134,10 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     let log = Log::open(&dir, &learner.position, options.clock)?;
     let (train, held_out) = (task.split.train.len(), task.split.held_out.len());
     log.say(&format!("{}: {train} episodes to train on, {held_out} held out", task.recipe.data.display()));
+    log.say(&format!("actions: {}", units::summary(&task.recipe.actions, &task.action_columns)));
+    for (index, notable) in task.action_columns.iter().map(ActionColumn::notable).enumerate() {
+        notable.into_iter().for_each(|notable| log.say(&format!("warning: actions, column {index}: {notable}")));
+    }
     if let Some(position) = resumed {
         log.say(&format!("going on at {} step {}", position.stage.name(), position.step));
     }

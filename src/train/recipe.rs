@@ -1,11 +1,17 @@
 //! A recipe: everything a training run depends on beside the data; typed, checked once, stored in the checkpoint.
 
-use super::optimizer::LearningRate;
+use super::{
+    dataset::{hidden::Hide, units::ActionsConfig},
+    optimizer::LearningRate,
+};
 use crate::model::{
     agent::SamplerOptions, config::Restart, denoiser::DenoiserConfig, diffusion::refine::LatentRouting, latent::LatentConfig,
 };
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::{
+    collections::BTreeSet,
+    path::{Path, PathBuf},
+};
 
 /// Why a recipe was refused.
 #[derive(Debug, thiserror::Error)]
@@ -56,6 +62,12 @@ pub struct Recipe {
     pub checkpoint_every: usize,
     /// Steps between two lines of the log.
     pub log_every: usize,
+    /// Units and bounds of actions.
+    #[serde(default)]
+    pub actions: ActionsConfig,
+    /// What is hidden of histories, so that acts may come without it.
+    #[serde(default)]
+    pub hide: Hide,
     /// What is built.
     pub model: Model,
     /// Latent identification; absent for models without latents.
@@ -166,6 +178,9 @@ pub struct Stage2 {
     pub routing: LatentRouting,
     /// Weight of the first action against one other entry of the window.
     pub first_action_weight: f32,
+    /// Chunk lengths that a session may ask for (T_a), beside `sampler.action_horizon`.
+    #[serde(default)]
+    pub action_horizons: Vec<usize>,
     /// Share of windows at READY rows, where latents are refined; the others are uniform over all rows.
     pub ready_fraction: f32,
     /// Largest decay of the EMA.
@@ -204,6 +219,12 @@ impl Recipe {
         toml::to_string(&table).expect("a table is TOML: is a bug")
     }
 
+    /// Chunk lengths to train, ascending: those of stage 2 and the default.
+    pub fn action_horizons(&self) -> Vec<usize> {
+        let all: BTreeSet<usize> = self.stage2.action_horizons.iter().copied().chain([self.sampler.action_horizon]).collect();
+        all.into_iter().collect()
+    }
+
     /// Steps an episode must have, and the keys that ask for them.
     pub fn episode_len_min(&self) -> (usize, String) {
         let window = (self.model.plan_horizon, "`model.plan_horizon`".to_string());
@@ -238,6 +259,9 @@ impl Recipe {
                 require(*heads >= 1 && width.is_multiple_of(*heads), "model.denoiser.heads", "must divide model.denoiser.width")?;
             }
         }
+        for (key, share) in [("hide.state", self.hide.state), ("hide.action", self.hide.action), ("hide.reward", self.hide.reward)] {
+            require((0.0..=1.0).contains(&share), key, "must lie in 0..=1")?;
+        }
         self.check_stage1()?;
         self.check_stage2()
     }
@@ -269,6 +293,10 @@ impl Recipe {
         require(stage.elbo_weight >= 0.0, "stage2.elbo_weight", "must not be negative")?;
         require(stage.elbo_weight == 0.0 || self.stage1.is_some(), "stage2.elbo_weight", "must be 0 without stage1")?;
         require(stage.latent_lr_factor >= 0.0, "stage2.latent_lr_factor", "must not be negative")?;
+        let within = stage.action_horizons.iter().all(|horizon| (1..=self.model.plan_horizon).contains(horizon));
+        require(within, "stage2.action_horizons", format!("must lie in 1..={} (model.plan_horizon)", self.model.plan_horizon))?;
+        let gaps = self.action_horizons().iter().all(|horizon| *horizon == 1) || self.hide.state > 0.0;
+        require(gaps, "hide.state", "must be above 0 where a chunk has several actions: its client may know no states in between")?;
         let unrefined = self.model.latent.is_some() && stage.routing != LatentRouting::Matched;
         let kappa = "must be 0: only stage2.routing = \"matched\" trains the refinement that it lets in";
         require(!unrefined || self.sampler.kappa == 0.0, "sampler.kappa", kappa)?;

@@ -2,7 +2,7 @@
 
 use super::{
     ceiling::ceiling,
-    dataset::hdf5,
+    dataset::{UnitsFrom, hdf5},
     probe::{Evidence, Score, Subjects, latent_probe},
 };
 use crate::model::checkpoint;
@@ -33,7 +33,7 @@ pub fn probe(dir: &Path, data: &Path) -> Result<Vec<Score>> {
         config.layout.action_dim
     );
     dataset.require_len(config.block_len + 2, "the block length")?;
-    let split = dataset.split(Some(&config.normalizer));
+    let (split, _) = dataset.split(UnitsFrom::Checkpoint(config))?;
     let subjects = Subjects { train: &split.train, held_out: &split.held_out, rows_max: ROWS };
     let mut block_lens = vec![1, 2, 4, config.block_len];
     block_lens.retain(|len| *len <= config.block_len);

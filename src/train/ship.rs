@@ -59,6 +59,7 @@ fn metrics(task: &Task, learner: &Learner, networks: &Networks) -> Result<Value>
     };
     let errors: Vec<f64> = RefineTask::new(task).held_out_errors(networks)?.into_iter().map(round).collect();
     Ok(json!({
+        "actions": task.action_columns,
         "stage1_attempts": learner.position.attempt + 1,
         "stage1_probes": learner.probes,
         "probe": probe,

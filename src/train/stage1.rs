@@ -45,6 +45,7 @@ impl<'a> ElboTask<'a> {
             latent_dim: latent.dim,
             show_action: stage.show_action,
             show_reward: stage.show_reward,
+            hide: task.recipe.hide,
         };
         let places = Places::new(&task.split.train, block_len, shape.len);
         Some(Self { task, stage, shape, places })

@@ -2,7 +2,10 @@
 
 use super::{
     Task,
-    dataset::window::{Places, WindowShape, windows},
+    dataset::{
+        hidden::Hide,
+        window::{Places, WindowShape, windows},
+    },
     learner::{Learner, Scalars},
     parallel::side_by_side,
     stage1::ElboTask,
@@ -53,8 +56,9 @@ impl<'a> RefineTask<'a> {
             block_len: task.config.block_len,
             obs_horizon: task.config.obs_horizon,
             sub_steps: sampler.sub_steps,
-            action_horizon: sampler.action_horizon,
+            action_horizons: task.recipe.action_horizons(),
             ready_fraction: stage.ready_fraction,
+            hide: task.recipe.hide,
         };
         let options =
             RefineOptions { routing: stage.routing, first_action_weight: stage.first_action_weight, sub_steps: sampler.sub_steps };
@@ -114,7 +118,7 @@ impl<'a> RefineTask<'a> {
     /// # Errors
     /// If a tensor operation fails.
     pub fn held_out_errors(&self, networks: &Networks) -> Result<Vec<f64>> {
-        let shape = WindowShape { batch: HELD_OUT_WINDOWS, ..self.shape.clone() };
+        let shape = WindowShape { batch: HELD_OUT_WINDOWS, hide: Hide::NOTHING, ..self.shape.clone() };
         let (episodes, rows) = (&self.task.split.held_out, shape.sub_steps * shape.plan_horizon);
         let places = shape.places(episodes);
         let error = |row: usize| -> Result<f64> {

@@ -1,6 +1,11 @@
 //! Whole runs on a small data set: what resumes, what is refused, what is shipped.
 
-use super::{Options, Outcome, Task, dataset::hdf5, recipe::Recipe, resume, run};
+use super::{
+    Options, Outcome, Task,
+    dataset::{UnitsFrom, hdf5, units::ActionsConfig},
+    recipe::Recipe,
+    resume, run,
+};
 use crate::model::checkpoint;
 use std::{
     fs,
@@ -181,14 +186,19 @@ fn data_sets_are_read_and_split() {
     assert_ne!(single.digest, double.digest);
     assert_eq!((single.episodes.len(), single.context_dim), (12, 1));
     assert!(single.episodes.iter().all(|episode| episode.len() == 24 && episode.context.iter().all(|push| *push == episode.context[0])));
-    let split = single.split(None);
+    let (split, columns) = single.split(UnitsFrom::Data(&ActionsConfig::default())).unwrap();
     assert_eq!((split.train.len(), split.held_out.len()), (10, 2));
     let states: Vec<f32> = split.train.iter().flat_map(|episode| episode.states.iter().step_by(3).copied()).collect();
     let mean = states.iter().sum::<f32>() / states.len() as f32;
     let var = states.iter().map(|state| (state - mean).powi(2)).sum::<f32>() / states.len() as f32;
     assert!(mean.abs() < 1e-5 && (var - 1.0).abs() < 1e-4, "{mean} {var}");
-    assert_eq!(split.normalizer.action.mean, [0.0, 0.0]);
-    assert_eq!(split.action_bounds, (vec![-1.0, -1.0], vec![1.0, 1.0]));
+    let actions: Vec<f32> = split.train.iter().flat_map(|episode| episode.actions.iter().copied()).collect();
+    assert!(actions.iter().all(|action| (-1.0..=1.0).contains(action)) && actions.contains(&1.0) && actions.contains(&-1.0));
+    for (j, column) in columns.iter().enumerate() {
+        assert_eq!((split.units.action_low[j], split.units.action_high[j]), (column.low, column.high));
+        let raw = single.episodes.iter().flat_map(|episode| episode.actions.iter().skip(j).step_by(2)).copied();
+        assert!(column.high <= raw.fold(f32::NEG_INFINITY, f32::max) && column.outside == 0);
+    }
 }
 
 #[test]

@@ -339,8 +339,10 @@ impl Descent {
         }
         let (normalizer, layout) = (&config.normalizer, config.layout);
         let actions: Vec<Vec<f32>> = self.emitted.chunks(layout.dim()).map(|position| position[layout.state_dim..].to_vec()).collect();
-        let planned = if self.evaluations > 0 { &self.x0 } else { &self.x };
-        let planned_states = planned.chunks(layout.dim()).map(|row| normalizer.state.denormalize(&row[..layout.state_dim]));
+        // Behind the positions given out since the last estimate; without any, the window itself, but for its last, fresh position.
+        let (dim, len) = (layout.dim(), self.x.len());
+        let planned = if self.evaluations > 0 { &self.x0[self.dropped * dim..] } else { &self.x[..len - dim] };
+        let planned_states = planned.chunks(dim).map(|row| normalizer.state.denormalize(&row[..layout.state_dim]));
         // An act that never asked the network has no latent of its own.
         let inferred = self.chain.of_first_step();
         let latent = if self.evaluations == 0 { self.episode.latent.clone().unwrap_or(inferred) } else { inferred };

@@ -17,6 +17,7 @@ pub use episode::Episode;
 pub use types::{AgentError, Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start};
 
 use crate::model::{Networks, config::ModelConfig, diffusion::ladder::Ladder, diffusion::process::Process};
+use std::collections::BTreeSet;
 
 /// A loaded model.
 pub struct Agent {
@@ -119,7 +120,8 @@ impl Agent {
     }
 
     /// Whether a session may ask for these options. Sub-steps are those of training: a network that has seen no levels
-    /// between the rungs is lost there (measured on Point-Wind-S: -21 becomes -119 with 2 sub-steps instead of 1).
+    /// between the rungs is lost there (measured on Point-Wind-S: -21 becomes -119 with 2 sub-steps instead of 1). So are the actions of a
+    /// chunk: one that never saw a window begin at an imagined state drifts off (-20 becomes -33 with 2 actions instead of 1).
     fn check_options(&self, options: &SamplerOptions) -> Result<(), AgentError> {
         let horizon = self.config.plan_horizon;
         let invalid = |field, reason: String| Err(AgentError::InvalidOptions { field, reason });
@@ -133,6 +135,14 @@ impl Agent {
             return invalid(
                 "sub_steps",
                 format!("this checkpoint was not trained for the levels of {} sub-steps a rung", options.sub_steps),
+            );
+        }
+        let horizons = &self.config.action_horizons_trained;
+        if options.action_horizon != self.config.sampler.action_horizon && !horizons.contains(&options.action_horizon) {
+            let trained: BTreeSet<usize> = horizons.iter().copied().chain([self.config.sampler.action_horizon]).collect();
+            return invalid(
+                "action_horizon",
+                format!("this checkpoint was trained for chunks of {trained:?} actions, not {}", options.action_horizon),
             );
         }
         if !(0.0..=1.0).contains(&options.eta) {

@@ -6,6 +6,8 @@ use crate::model::{
     trajectory::Layout,
 };
 
+mod trained;
+
 const HORIZON: usize = 8;
 
 fn options() -> SamplerOptions {
@@ -164,7 +166,8 @@ fn history_reaches_the_latent_and_missing_parts_are_allowed() {
 
 #[test]
 fn bad_observations_name_the_field() {
-    let agent = agent(true, 1, unet());
+    let mut agent = agent(true, 1, unet());
+    agent.config.missing_trained.action = false;
     let episode = agent.open(1, &options()).unwrap();
     let field = |state: Vec<f32>, executed| match agent.begin(&episode, &Observation { state, executed }) {
         Err(AgentError::InvalidObservation { field, .. }) => field,

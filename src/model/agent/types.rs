@@ -92,7 +92,8 @@ pub struct Executed {
 pub struct Chunk {
     /// `(action_horizon, action_dim)`, raw units.
     pub actions: Vec<Vec<f32>>,
-    /// Denoised estimate of the states of the window after the chunk's last action, `(plan_horizon, state_dim)`, raw units.
+    /// Estimate of the states after the chunk's last action, one step after the other, the first of them `predicted_state`:
+    /// `(plan_horizon - 1, state_dim)`, raw units; a degraded act may know fewer.
     pub planned_states: Vec<Vec<f32>>,
     /// Mean of the latent of the chunk's first step, `latent_dim` values.
     pub latent_mean: Vec<f32>,

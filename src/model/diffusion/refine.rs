@@ -184,7 +184,7 @@ fn teacher_forced_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<T
     let (len, before) = (batch.window.dim(1)?, batch.history.batch_len()?.1);
     let tokens = batch.history.concat(&window_tokens(batch, &batch.window, 0..len, [1.0, 1.0], None)?)?;
     let seen = tokens.narrow(1, before + len - 1)?.present;
-    let posteriors = latent.posteriors(&tokens, &seen)?.narrow(before, len - 1)?;
+    let posteriors = latent.posteriors(&tokens, &tokens.present, &seen)?.narrow(before, len - 1)?;
     let last = latent.prior.predict(&posteriors.narrow(len - 2, 1)?)?;
     Tensor::cat(&[posteriors.mean, last.mean], 1)
 }

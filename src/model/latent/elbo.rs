@@ -9,9 +9,11 @@ pub struct ElboBatch {
     pub tokens: Tokens,
     /// `(B, L - 1)`: 1 where both position t and t + 1 are real.
     pub valid: Tensor,
+    /// `(B, L, 3)`: which parts of a token are shown while it is history; a hidden part is still what the decoder has to explain.
+    pub history_shown: Tensor,
     /// `(B, L - 1, 3)`: which parts of the successor x_{t+1} the posterior of c_t may see; the state always, action and reward now and then,
     /// so that one network serves the filter (state alone) and the refinement (state and action).
-    pub successor_present: Tensor,
+    pub successor_shown: Tensor,
     /// `(B, L - 1, dim)` Gaussian draws of the latents.
     pub eps: Tensor,
 }
@@ -40,16 +42,17 @@ pub struct ElboTerms {
 }
 
 impl LatentModel {
-    /// Posteriors q(c_t) for t = 0 .. L-2, from the GRU state after x_t and a throw-away step on what is seen of x_{t+1}:
-    /// Gaussians of `(B, L - 1, dim)`.
+    /// Posteriors q(c_t) for t = 0 .. L-2, from the GRU state after x_t and a throw-away step on what is shown of x_{t+1}:
+    /// Gaussians of `(B, L - 1, dim)`. `history_shown` and `successor_shown` as in [`ElboBatch`].
     ///
     /// # Errors
     /// If widths differ.
-    pub fn posteriors(&self, tokens: &Tokens, successor_present: &Tensor) -> Result<Gaussian> {
+    pub fn posteriors(&self, tokens: &Tokens, history_shown: &Tensor, successor_shown: &Tensor) -> Result<Gaussian> {
         let (batch, len) = tokens.batch_len()?;
-        let states = self.encoder.states(&tokens.narrow(0, len - 1)?, None)?;
-        let mut successors = tokens.narrow(1, len - 1)?;
-        successors.present = successors.present.mul(successor_present)?;
+        let (mut history, mut successors) = (tokens.narrow(0, len - 1)?, tokens.narrow(1, len - 1)?);
+        history.present = history.present.mul(&history_shown.narrow(1, 0, len - 1)?)?;
+        successors.present = successors.present.mul(successor_shown)?;
+        let states = self.encoder.states(&history, None)?;
         let rows = batch * (len - 1);
         let flat = |t: &Tensor| t.reshape((rows, 1, ()));
         let successors = Tokens {
@@ -75,7 +78,7 @@ impl LatentModel {
     /// If shapes differ.
     pub fn elbo(&self, batch: &ElboBatch, options: &ElboOptions) -> Result<ElboTerms> {
         let (_, len) = batch.tokens.batch_len()?;
-        let q = self.posteriors(&batch.tokens, &batch.successor_present)?;
+        let q = self.posteriors(&batch.tokens, &batch.history_shown, &batch.successor_shown)?;
         let latent = q.sample(&batch.eps)?;
         let (now, next) = (batch.tokens.narrow(0, len - 1)?, batch.tokens.narrow(1, len - 1)?);
         let (change, reward) = self.decoder.predict(&now.state, &now.action, &latent)?;

@@ -23,7 +23,8 @@ fn options() -> ElboOptions {
 
 /// The second row begins before its episode: two absent tokens.
 fn batch() -> ElboBatch {
-    let mut stream = Philox::new(5);
+    // Numbers that lie away from the kinks of the ReLUs, where a central difference means nothing.
+    let mut stream = Philox::new(21);
     let mut draw = |n: usize| (0..n).map(|_| stream.normal()).collect::<Vec<f32>>();
     let absent = |row: usize, t: usize| row == 1 && t < 2;
     let rows: Vec<Vec<Token>> = (0..BATCH)
@@ -37,11 +38,14 @@ fn batch() -> ElboBatch {
         .collect();
     let valid = (0..BATCH).flat_map(|row| (0..LEN - 1).map(move |t| f32::from(!absent(row, t)))).collect::<Vec<_>>();
     let present = (0..BATCH * (LEN - 1)).flat_map(|i| [1.0, f32::from(i % 2 == 0), f32::from(i % 4 == 0)]).collect::<Vec<_>>();
+    // The last row hides its rewards, and every other state.
+    let shown = (0..BATCH * LEN).flat_map(|i| if i / LEN == 2 { [f32::from(i % 2 == 0), 1.0, 0.0] } else { [1.0; 3] }).collect::<Vec<_>>();
     let tensor = |values: Vec<f32>, width| Tensor::from_vec(values, (BATCH, LEN - 1, width), &Device::Cpu).unwrap();
     ElboBatch {
         tokens: Tokens::pack(layout(), rows.iter(), LEN, |row, position| row[position].view()).unwrap(),
         valid: tensor(valid, 1).squeeze(2).unwrap(),
-        successor_present: tensor(present, 3),
+        history_shown: Tensor::from_vec(shown, (BATCH, LEN, 3), &Device::Cpu).unwrap(),
+        successor_shown: tensor(present, 3),
         eps: tensor(draw(BATCH * (LEN - 1) * DIM), DIM),
     }
 }
@@ -97,11 +101,31 @@ fn posteriors_agree_with_infer() {
     let model = model(&Params::fresh(2));
     let batch = batch();
     let state_only = Tensor::new(&[1f32, 0.0, 0.0], &Device::Cpu).unwrap().broadcast_as((BATCH, LEN - 1, 3)).unwrap().contiguous().unwrap();
-    let posteriors = model.posteriors(&batch.tokens, &state_only).unwrap();
+    let posteriors = model.posteriors(&batch.tokens, &batch.history_shown, &state_only).unwrap();
     let mut block = batch.tokens.clone();
     let last = (block.present.narrow(1, LEN - 1, 1).unwrap() * state_only.narrow(1, 0, 1).unwrap()).unwrap();
-    block.present = Tensor::cat(&[block.present.narrow(1, 0, LEN - 1).unwrap(), last], 1).unwrap();
+    let history = (block.present.narrow(1, 0, LEN - 1).unwrap() * batch.history_shown.narrow(1, 0, LEN - 1).unwrap()).unwrap();
+    block.present = Tensor::cat(&[history, last], 1).unwrap();
     let filter = model.infer(&block).unwrap();
     let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     assert_eq!(flat(&posteriors.mean.narrow(1, LEN - 2, 1).unwrap()), flat(&filter.mean));
+}
+
+/// A hidden field of the history does not move the posterior, and is still what the decoder has to explain.
+#[test]
+fn hidden_fields_are_explained_but_not_seen() {
+    let model = model(&Params::fresh(2));
+    let (clean, mut dirty) = (batch(), batch());
+    let row = Tensor::from_vec(vec![0f32, 0.0, 5.0], (BATCH, 1, 1), &Device::Cpu).unwrap();
+    dirty.tokens.reward = dirty.tokens.reward.broadcast_add(&row).unwrap();
+    // The successor's reward is another door: it stays shut here.
+    let shut = Tensor::new(&[1f32, 1.0, 0.0], &Device::Cpu).unwrap();
+    let terms = |mut batch: ElboBatch| {
+        batch.successor_shown = batch.successor_shown.broadcast_mul(&shut).unwrap();
+        let terms = model.elbo(&batch, &options()).unwrap();
+        [terms.kl, terms.state_error, terms.reward_error].map(|term| term.to_scalar::<f32>().unwrap())
+    };
+    let (clean, dirty) = (terms(clean), terms(dirty));
+    assert_eq!(clean[..2], dirty[..2]);
+    assert!((clean[2] - dirty[2]).abs() > 0.1, "{clean:?} {dirty:?}");
 }

@@ -1,8 +1,13 @@
 //! Offline trajectories: read, checked, split by episodes, brought to the units of the networks.
 pub mod hdf5;
+pub mod hidden;
+pub mod units;
 pub mod window;
 
+use units::{ActionColumn, ActionsConfig};
+
 use crate::model::{
+    config::ModelConfig,
     noise::Philox,
     normalizer::{Affine, Normalizer},
     trajectory::Layout,
@@ -101,11 +106,11 @@ impl Episode {
         &self.context[t * self.context_dim..][..self.context_dim]
     }
 
-    fn normalized(&self, normalizer: &Normalizer) -> Self {
+    fn normalized(&self, units: &Units) -> Self {
         Self {
-            states: normalizer.state.normalize(&self.states),
-            actions: normalizer.action.normalize(&self.actions),
-            rewards: normalizer.reward.normalize(&self.rewards),
+            states: units.normalizer.state.normalize(&self.states),
+            actions: units.normalizer.action.normalize_within(&self.actions, &units.action_low, &units.action_high),
+            rewards: units.normalizer.reward.normalize(&self.rewards),
             ..self.clone()
         }
     }
@@ -132,10 +137,27 @@ pub struct Split {
     pub train: Vec<Episode>,
     /// Episodes to measure on.
     pub held_out: Vec<Episode>,
-    /// Fitted on the training episodes.
+    /// Their units, fitted on the training episodes.
+    pub units: Units,
+}
+
+/// The units that a data set is brought to.
+#[derive(Clone, Debug)]
+pub struct Units {
+    /// The map to them.
     pub normalizer: Normalizer,
-    /// Bounds of each action column, raw units.
-    pub action_bounds: (Vec<f32>, Vec<f32>),
+    /// Lower bound of each action column, raw units; what lies outside is held within.
+    pub action_low: Vec<f32>,
+    /// Upper bounds.
+    pub action_high: Vec<f32>,
+}
+
+/// Where units come from.
+pub enum UnitsFrom<'a> {
+    /// The data, with these wishes for actions.
+    Data(&'a ActionsConfig),
+    /// A checkpoint.
+    Checkpoint(&'a ModelConfig),
 }
 
 impl Dataset {
@@ -156,8 +178,12 @@ impl Dataset {
         }
     }
 
-    /// Splits by episodes, drawn once and for all seeds alike, and normalizes by what the training part says, or by `normalizer`.
-    pub fn split(&self, normalizer: Option<&Normalizer>) -> Split {
+    /// Splits by episodes, drawn once and for all seeds alike, and brings them to units. What was chosen for the columns of actions is
+    /// told beside it; with the units of a checkpoint nothing is chosen.
+    ///
+    /// # Errors
+    /// If the bounds wished for do not fit the columns.
+    pub fn split(&self, from: UnitsFrom) -> Result<(Split, Vec<ActionColumn>), DatasetError> {
         let mut order: Vec<usize> = (0..self.episodes.len()).collect();
         let mut rng = Philox::new(SPLIT_SEED);
         for last in (1..order.len()).rev() {
@@ -166,38 +192,38 @@ impl Dataset {
         let (held_out, train) = order.split_at(self.episodes.len().div_ceil(HELD_OUT_EVERY));
         let mut train = train.to_vec();
         train.sort_unstable();
-        let action_bounds = self.action_bounds();
-        let normalizer = normalizer.cloned().unwrap_or_else(|| fit(train.iter().map(|i| &self.episodes[*i]), self.layout, &action_bounds));
-        let normalized = |indices: &[usize]| indices.iter().map(|i| self.episodes[*i].normalized(&normalizer)).collect();
-        Split { train: normalized(&train), held_out: normalized(held_out), action_bounds, normalizer }
+        let (units, columns) = match from {
+            UnitsFrom::Data(wishes) => self.fit(train.iter().map(|i| &self.episodes[*i]), wishes)?,
+            UnitsFrom::Checkpoint(config) => {
+                let (action_low, action_high) = (config.action_low.clone(), config.action_high.clone());
+                (Units { normalizer: config.normalizer.clone(), action_low, action_high }, Vec::new())
+            }
+        };
+        let normalized = |indices: &[usize]| indices.iter().map(|i| self.episodes[*i].normalized(&units)).collect();
+        Ok((Split { train: normalized(&train), held_out: normalized(held_out), units }, columns))
     }
 
-    /// -1 and 1 for a column within them, else the extremes of the data.
-    fn action_bounds(&self) -> (Vec<f32>, Vec<f32>) {
-        let dim = self.layout.action_dim;
-        let column = |j: usize| self.episodes.iter().flat_map(move |episode| episode.actions.iter().skip(j).step_by(dim).copied());
-        let low = (0..dim).map(|j| column(j).fold(-1.0, f32::min)).collect();
-        let high = (0..dim).map(|j| column(j).fold(1.0, f32::max)).collect();
-        (low, high)
+    /// Gaussian maps for states and rewards, those of [`units`] for actions.
+    fn fit<'a>(
+        &self,
+        episodes: impl Iterator<Item = &'a Episode> + Clone,
+        wishes: &ActionsConfig,
+    ) -> Result<(Units, Vec<ActionColumn>), DatasetError> {
+        let layout = self.layout;
+        let rows = episodes.clone().flat_map(|episode| episode.actions.chunks_exact(layout.action_dim.max(1)));
+        let columns = units::fit(wishes, &self.path, layout.action_dim, rows)?;
+        let states: Vec<f32> = episodes.clone().flat_map(|episode| episode.states.iter().copied()).collect();
+        let rewards: Vec<f32> = episodes.clone().flat_map(|episode| episode.rewards.iter().copied()).collect();
+        let (state, reward) = (Affine::fit(&states, layout.state_dim), Affine::fit(&rewards, 1));
+        let changes: Vec<f32> = episodes
+            .flat_map(|episode| {
+                (1..episode.len()).flat_map(move |t| episode.state(t).iter().zip(episode.state(t - 1)).map(|(next, now)| next - now))
+            })
+            .collect();
+        let change = Affine::fit(&changes, layout.state_dim);
+        let state_change_std = change.std.iter().zip(&state.std).map(|(change, state)| change / state).collect();
+        let normalizer = Normalizer { state, action: units::affine_of(&columns), reward, state_change_std };
+        let bounds = |of: fn(&ActionColumn) -> f32| columns.iter().map(of).collect();
+        Ok((Units { normalizer, action_low: bounds(|column| column.low), action_high: bounds(|column| column.high) }, columns))
     }
-}
-
-/// Gaussian maps for states and rewards; actions are mapped from their bounds to [-1, 1], so data within [-1, 1] stay as they are.
-fn fit<'a>(episodes: impl Iterator<Item = &'a Episode> + Clone, layout: Layout, (low, high): &(Vec<f32>, Vec<f32>)) -> Normalizer {
-    let states: Vec<f32> = episodes.clone().flat_map(|episode| episode.states.iter().copied()).collect();
-    let rewards: Vec<f32> = episodes.clone().flat_map(|episode| episode.rewards.iter().copied()).collect();
-    let (state, reward) = (Affine::fit(&states, layout.state_dim), Affine::fit(&rewards, 1));
-    let changes: Vec<f32> = episodes
-        .flat_map(|episode| {
-            (1..episode.len()).flat_map(move |t| episode.state(t).iter().zip(episode.state(t - 1)).map(|(next, now)| next - now))
-        })
-        .collect();
-    let change = Affine::fit(&changes, layout.state_dim);
-    let state_change_std = change.std.iter().zip(&state.std).map(|(change, state)| change / state).collect();
-    let bounds = low.iter().zip(high);
-    let action = Affine {
-        mean: bounds.clone().map(|(low, high)| 0.5 * (low + high)).collect(),
-        std: bounds.map(|(low, high)| 0.5 * (high - low)).collect(),
-    };
-    Normalizer { state, action, reward, state_change_std }
 }

@@ -1,6 +1,6 @@
 //! Batches: blocks for stage 1 and windows for stage 2, cut from episodes at drawn places.
 
-use super::Episode;
+use super::{Episode, hidden::Hide};
 use crate::model::{
     diffusion::refine::WindowBatch,
     latent::{Tokens, elbo::ElboBatch},
@@ -25,6 +25,13 @@ impl Seen {
     pub const ALL: Self = Self { state: true, action: true, reward: true };
     /// The state alone: the current time of a decision.
     pub const STATE: Self = Self { state: true, action: false, reward: false };
+    /// Nothing of it.
+    pub const NOTHING: Self = Self { state: false, action: false, reward: false };
+
+    /// 1 for each part that is shown, in the order of a token's presence.
+    pub fn flags(self) -> [f32; 3] {
+        [self.state, self.action, self.reward].map(f32::from)
+    }
 }
 
 /// Token columns under construction, row after row.
@@ -45,7 +52,7 @@ impl TokenRows {
     /// Appends x_t of an episode, wholly absent where `t` lies outside of it.
     pub fn push(&mut self, episode: &Episode, t: isize, seen: Seen) {
         let inside = usize::try_from(t).ok().filter(|t| *t < episode.len());
-        let flags = [seen.state, seen.action, seen.reward].map(|seen| f32::from(seen && inside.is_some()));
+        let flags = if inside.is_some() { seen.flags() } else { Seen::NOTHING.flags() };
         self.present.extend(flags);
         let t = inside.unwrap_or(0);
         self.state.extend(episode.state(t).iter().map(|value| value * flags[0]));
@@ -104,6 +111,8 @@ pub struct BlockShape {
     pub show_action: f32,
     /// Probability that it sees the successor's reward, given that it sees the action.
     pub show_reward: f32,
+    /// What is hidden of the history.
+    pub hide: Hide,
 }
 
 /// Draws a batch of blocks; `places` must be made for this shape.
@@ -113,24 +122,29 @@ pub struct BlockShape {
 pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &mut Philox) -> Result<ElboBatch> {
     let steps = shape.len - 1;
     let mut rows = TokenRows::new(episodes[0].layout);
-    let (mut valid, mut successor) = (Vec::with_capacity(shape.batch * steps), Vec::with_capacity(shape.batch * steps * 3));
+    let (mut valid, mut history) = (Vec::with_capacity(shape.batch * steps), Vec::with_capacity(shape.batch * shape.len * 3));
+    let mut successor = Vec::with_capacity(shape.batch * steps * 3);
     for _ in 0..shape.batch {
         let (episode, start) = places.draw(rng);
+        let hidden = shape.hide.draw(rng);
         for t in start..start + shape.len as isize {
             rows.push(&episodes[episode], t, Seen::ALL);
+            history.extend(hidden.step(rng).flags());
         }
         for t in start..start + steps as isize {
             let action = rng.uniform() < shape.show_action;
             let reward = rng.uniform() < shape.show_reward && action;
             valid.push(f32::from(t >= 0));
-            successor.extend([1.0, f32::from(action), f32::from(reward)]);
+            let ever = hidden.ever();
+            successor.extend([1.0, f32::from(action && ever.action), f32::from(reward && ever.reward)]);
         }
     }
     let eps = (0..shape.batch * steps * shape.latent_dim).map(|_| rng.normal()).collect();
     Ok(ElboBatch {
         tokens: rows.tokens(shape.len)?,
         valid: Tensor::from_vec(valid, (shape.batch, steps), &Device::Cpu)?,
-        successor_present: Tensor::from_vec(successor, (shape.batch, steps, 3), &Device::Cpu)?,
+        history_shown: Tensor::from_vec(history, (shape.batch, shape.len, 3), &Device::Cpu)?,
+        successor_shown: Tensor::from_vec(successor, (shape.batch, steps, 3), &Device::Cpu)?,
         eps: Tensor::from_vec::<_, f32>(eps, (shape.batch, steps, shape.latent_dim), &Device::Cpu)?,
     })
 }
@@ -148,10 +162,12 @@ pub struct WindowShape {
     pub obs_horizon: usize,
     /// Sub-steps per rung (n).
     pub sub_steps: usize,
-    /// Actions an act returns (T_a): the sampler imagines up to `action_horizon - 1` steps of its history.
-    pub action_horizon: usize,
+    /// Numbers of actions that an act may return (T_a): the sampler imagines up to `T_a - 1` steps of its history.
+    pub action_horizons: Vec<usize>,
     /// Share of windows at READY rows, where latents are refined.
     pub ready_fraction: f32,
+    /// What is hidden of the history.
+    pub hide: Hide,
 }
 
 impl WindowShape {
@@ -165,10 +181,22 @@ impl WindowShape {
         Places::new(episodes, 0, self.plan_horizon)
     }
 
+    /// What is seen of each step before the window, the last one first. Of imagined steps the sampler has its own states and actions,
+    /// and never a reward.
+    fn seen(&self, imagined: usize, rng: &mut Philox) -> Vec<Seen> {
+        let hidden = self.hide.draw(rng);
+        let seen = |back: usize| match (hidden.step(rng), back < imagined) {
+            (_, true) => Seen { reward: false, ..Seen::ALL },
+            (seen, false) => seen,
+        };
+        (0..self.block_len.max(self.obs_horizon - 1)).map(seen).collect()
+    }
+
     /// Ladder row and number of imagined steps. Only a window at READY can have imagined steps behind it.
     fn draw_row(&self, rng: &mut Philox) -> (usize, usize) {
         let ready = rng.uniform() < self.ready_fraction;
-        let (row, imagined) = (rng.uniform(), rng.below(self.action_horizon));
+        let actions = self.action_horizons[rng.below(self.action_horizons.len())];
+        let (row, imagined) = (rng.uniform(), rng.below(actions));
         let below = |bound: usize| ((row * bound as f32) as usize).min(bound - 1);
         if ready {
             return (self.ready() + below(self.sub_steps), imagined);
@@ -192,11 +220,16 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
         let episode = &episodes[index];
         let (drawn, imagined) = shape.draw_row(rng);
         let imagined = if row.is_some() { 0 } else { imagined };
-        for t in start - shape.block_len as isize..start {
-            history.push(episode, t, Seen { reward: t < start - imagined as isize, ..Seen::ALL });
+        for (back, seen) in shape.seen(imagined, rng).into_iter().enumerate().rev() {
+            let (t, back) = (start - 1 - back as isize, back + 1);
+            if back <= shape.block_len {
+                history.push(episode, t, seen);
+            }
+            if back < shape.obs_horizon {
+                push_step(&mut observed, episode, t, seen);
+            }
         }
-        (start..start + shape.plan_horizon as isize).for_each(|t| push_step(&mut window, episode, t));
-        (start + 1 - shape.obs_horizon as isize..start).for_each(|t| push_step(&mut observed, episode, t));
+        (start..start + shape.plan_horizon as isize).for_each(|t| push_step(&mut window, episode, t, Seen::ALL));
         rows.push(row.unwrap_or(drawn));
         inpaint.push(imagined == 0);
     }
@@ -216,15 +249,15 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
     })
 }
 
-/// (s_t, a_t), or zeros before the start.
-fn push_step(out: &mut Vec<f32>, episode: &Episode, t: isize) {
-    match usize::try_from(t) {
-        Ok(t) => {
-            out.extend_from_slice(episode.state(t));
-            out.extend_from_slice(episode.action(t));
-        }
-        Err(_) => out.extend(std::iter::repeat_n(0.0, episode.layout.dim())),
-    }
+/// (s_t, a_t), zeros for what is not seen and before the start.
+fn push_step(out: &mut Vec<f32>, episode: &Episode, t: isize, seen: Seen) {
+    let Layout { state_dim, action_dim } = episode.layout;
+    let (t, inside) = (usize::try_from(t).unwrap_or(0), t >= 0);
+    let mut part = |shown: bool, values: &[f32], width: usize| {
+        if shown && inside { out.extend_from_slice(values) } else { out.extend(std::iter::repeat_n(0.0, width)) }
+    };
+    part(seen.state, episode.state(t), state_dim);
+    part(seen.action, episode.action(t), action_dim);
 }
 
 #[cfg(test)]
@@ -253,11 +286,11 @@ mod tests {
     #[test]
     fn blocks_run_into_an_episode_and_never_out_of_it() {
         let episodes = episodes();
-        let shape = BlockShape { batch: 200, len: 8, before: 3, latent_dim: 2, show_action: 0.5, show_reward: 0.5 };
+        let shape = BlockShape { batch: 200, len: 8, before: 3, latent_dim: 2, show_action: 0.5, show_reward: 0.5, hide: Hide::NOTHING };
         let places = Places::new(&episodes, shape.before, shape.len);
         let batch = blocks(&episodes, &places, &shape, &mut Philox::new(1)).unwrap();
         let (states, present) = (rows(&batch.tokens.state), rows(&batch.tokens.present));
-        let (valid, shown) = (batch.valid.to_vec2::<f32>().unwrap(), rows(&batch.successor_present));
+        let (valid, shown) = (batch.valid.to_vec2::<f32>().unwrap(), rows(&batch.successor_shown));
         let mut absent_fronts = [0; 4];
         for row in 0..shape.batch {
             let front = present[row].iter().take_while(|flags| flags[0] == 0.0).count();
@@ -287,8 +320,16 @@ mod tests {
     #[test]
     fn windows_follow_their_history() {
         let episodes = episodes();
-        let shape =
-            WindowShape { batch: 300, plan_horizon: 4, block_len: 3, obs_horizon: 3, sub_steps: 2, action_horizon: 3, ready_fraction: 0.5 };
+        let shape = WindowShape {
+            batch: 300,
+            plan_horizon: 4,
+            block_len: 3,
+            obs_horizon: 3,
+            sub_steps: 2,
+            action_horizons: vec![3],
+            ready_fraction: 0.5,
+            hide: Hide::NOTHING,
+        };
         let batch = windows(&episodes, &shape.places(&episodes), &shape, None, &mut Philox::new(2)).unwrap();
         let (window, history) = (rows(&batch.window), rows(&batch.history.state));
         let (present, observed) = (rows(&batch.history.present), batch.observed.unwrap().squeeze(1).unwrap().to_vec2::<f32>().unwrap());
@@ -324,5 +365,53 @@ mod tests {
         assert!((ready as f32 / 300.0 - 0.625).abs() < 0.1, "half, and a quarter of the rest: {ready}");
         let fixed = windows(&episodes, &shape.places(&episodes), &shape, Some(7), &mut Philox::new(2)).unwrap();
         assert!(fixed.rows == vec![7; 300] && fixed.inpaint.iter().all(|inpaint| *inpaint));
+    }
+
+    /// Fields of the history go missing in training as they do at an act, for the latent and the denoiser alike; what a block has to
+    /// explain stays whole.
+    #[test]
+    fn hidden_fields_are_hidden_from_both_networks() {
+        let (episodes, hide) = (episodes(), Hide { state: 0.5, action: 0.5, reward: 0.5 });
+        let shape = WindowShape {
+            batch: 400,
+            plan_horizon: 4,
+            block_len: 3,
+            obs_horizon: 3,
+            sub_steps: 1,
+            action_horizons: vec![1, 2],
+            ready_fraction: 0.5,
+            hide,
+        };
+        let batch = windows(&episodes, &shape.places(&episodes), &shape, None, &mut Philox::new(2)).unwrap();
+        let (present, state) = (rows(&batch.history.present), rows(&batch.history.state));
+        let observed = batch.observed.unwrap().squeeze(1).unwrap().to_vec2::<f32>().unwrap();
+        let (window, mut missing) = (rows(&batch.window), [0; 3]);
+        for row in 0..shape.batch {
+            let steps = window[row][0][0] as usize % 100;
+            for back in 1..=steps.min(3) {
+                let flags = &present[row][3 - back];
+                (0..3).for_each(|part| missing[part] += usize::from(flags[part] == 0.0));
+                assert_eq!(state[row][3 - back][0], flags[0] * (window[row][0][0] - back as f32));
+                if back <= 2 {
+                    let seen = &observed[row][(2 - back) * 3..][..3];
+                    assert_eq!((seen[0], seen[2]), (state[row][3 - back][0], flags[1] * (steps - back) as f32 / 10.0));
+                }
+                if !batch.inpaint[row] && back == 1 {
+                    assert_eq!(flags[..], [1.0, 1.0, 0.0], "an imagined step is the sampler's own");
+                }
+            }
+            assert!(window[row].iter().all(|step| step[0] != 0.0));
+        }
+        assert!(missing.iter().all(|count| *count > 100), "{missing:?}");
+        let shape = BlockShape { batch: 200, len: 8, before: 0, latent_dim: 2, show_action: 1.0, show_reward: 1.0, hide };
+        let batch = blocks(&episodes, &Places::new(&episodes, 0, 8), &shape, &mut Philox::new(1)).unwrap();
+        assert!(rows(&batch.tokens.present).iter().flatten().flatten().all(|flag| *flag == 1.0));
+        let (history, successor) = (rows(&batch.history_shown), rows(&batch.successor_shown));
+        let hidden = |part: usize| history.iter().filter(|block| block.iter().all(|step| step[part] == 0.0)).count();
+        assert!((0..3).all(|part| (30..80).contains(&hidden(part))), "a quarter of the blocks lacks a field altogether");
+        assert!(successor.iter().flatten().all(|step| step[0] == 1.0), "the newest state is always there");
+        let never = |steps: &[Vec<f32>]| steps.iter().all(|step| step[2] == 0.0);
+        let told = history.iter().zip(&successor).filter(|(history, successor)| never(history) && !never(successor)).count();
+        assert!(told < 5, "a reward that is never told is not told of the successor, but for all of eight coins: {told}");
     }
 }
