@@ -2,6 +2,7 @@
 use ada_diffuser::restart;
 use ada_diffuser::train::{
     self, Options, Outcome,
+    dataset::room::Room,
     flags::{Cli, Inspect, Probe, Run},
     parallel,
     recipe::Recipe,
@@ -44,7 +45,8 @@ fn run(flags: Run) -> Result<ExitCode> {
         move || interrupted(&stop)
     });
     let clock = Box::new(|| SystemTime::UNIX_EPOCH.elapsed().map_or(0.0, |time| time.as_secs_f64()));
-    let outcome = train::run(recipe, Options { out, stop_after_steps: flags.stop_after_steps, stop: stop.clone(), clock })?;
+    let (stop_after_steps, data_memory_mib) = (flags.stop_after_steps, flags.data_memory_mib);
+    let outcome = train::run(recipe, Options { out, stop_after_steps, stop: stop.clone(), data_memory_mib, clock })?;
     let interrupted = outcome == Outcome::Stopped && stop.load(Ordering::Relaxed);
     Ok(if interrupted { ExitCode::from(130) } else { ExitCode::SUCCESS })
 }
@@ -61,7 +63,9 @@ fn interrupted(stop: &AtomicBool) {
 }
 
 fn probe(flags: &Probe) -> Result<ExitCode> {
-    let scores = report::probe(&flags.checkpoint, &flags.data)?;
+    let room = Room::new(flags.data_memory_mib, std::env::temp_dir());
+    let (scores, notes) = report::probe(&flags.checkpoint, &flags.data, &room)?;
+    notes.iter().for_each(|note| eprintln!("{note}"));
     println!("{}", if flags.json { serde_json::to_string_pretty(&scores)? } else { report::probe_table(&scores) });
     Ok(ExitCode::SUCCESS)
 }

@@ -4,16 +4,19 @@
 //! context at its time, then a linear filter over the estimates of a block.
 
 use super::{
-    dataset::Episode,
+    dataset::{Episode, rows::pieces},
     probe::{Evidence, Features, Place, Score, Subjects, places, score},
     ridge::{Ridge, Table},
 };
 use anyhow::Result;
+use std::io;
 
 /// Penalties of the two steps; the first has about a thousand features.
 const LAMBDA: (f64, f64) = (1e-3, 1e-6);
 /// Rows on which the first step is fitted.
 const FIT_ROWS: usize = 12_000;
+/// Transitions whose features are made at once.
+const CHUNK: usize = 4096;
 /// Transitions with more columns than this get linear features only.
 const QUADRATIC_COLUMNS_MAX: usize = 64;
 
@@ -21,25 +24,34 @@ const QUADRATIC_COLUMNS_MAX: usize = 64;
 /// data's expert knew, so it has no ceiling.
 ///
 /// # Errors
-/// Never for episodes with a context.
+/// If an episode cannot be read.
 pub fn ceiling(subjects: &Subjects, block_lens: &[usize]) -> Result<Vec<Score>> {
-    let (fit_on, truth) = transitions(subjects.train, &places(subjects.train, FIT_ROWS));
-    let ridge = Ridge::fit(&fit_on, &truth, LAMBDA.0);
-    let estimates = |episodes: &[Episode]| -> Vec<Table> {
-        let all = |index: usize, episode: &Episode| (0..episode.len() - 1).map(|t| (index, t)).collect::<Vec<Place>>();
-        episodes.iter().enumerate().map(|(index, episode)| ridge.predict(&transitions(episodes, &all(index, episode)).0)).collect()
+    let (fit_on, truth) = transitions(subjects.train, &places(subjects.train, FIT_ROWS))?;
+    let (ridge, dim) = (Ridge::fit(&fit_on, &truth, LAMBDA.0), truth.width);
+    let estimates = |episodes: &[Episode]| -> io::Result<Vec<Table>> {
+        (0..episodes.len()).map(|index| estimates(&ridge, dim, episodes, index)).collect()
     };
-    let (train, held_out) = (estimates(subjects.train), estimates(subjects.held_out));
+    let (train, held_out) = (estimates(subjects.train)?, estimates(subjects.held_out)?);
     let mut scores = Vec::new();
     for block_len in block_lens {
         for evidence in [Evidence::Filter, Evidence::SuccessorState] {
             let features = |episodes, estimates: &[Table]| filter_features(episodes, estimates, (evidence, *block_len), subjects.rows_max);
             let (fit, test) = (features(subjects.train, &train), features(subjects.held_out, &held_out));
-            let (error, error_all) = score(&fit, &test, 0, *block_len, LAMBDA.1);
+            let (error, error_all) = score(&fit, &test, 0, *block_len, LAMBDA.1)?;
             scores.push(Score { source: "ceiling", evidence, block_len: *block_len, shift: 0, error, r2: 1.0 - error, error_all });
         }
     }
     Ok(scores)
+}
+
+/// Estimates of the context at each transition of one episode, `dim` columns; a long episode's features would not fit into memory.
+fn estimates(ridge: &Ridge, dim: usize, episodes: &[Episode], index: usize) -> io::Result<Table> {
+    let mut table = Table::new(dim);
+    for piece in pieces(0..episodes[index].len() - 1, CHUNK) {
+        let places: Vec<Place> = piece.map(|t| (index, t)).collect();
+        table.values.extend(ridge.predict(&transitions(episodes, &places)?.0).values);
+    }
+    Ok(table)
 }
 
 /// Estimates of the transitions of a block, latest first: from t - 1 back without the successor, from t back with it; 0 before the start.
@@ -61,12 +73,13 @@ fn filter_features<'a>(episodes: &'a [Episode], estimates: &[Table], seen: (Evid
 }
 
 /// Quadratic features of the transitions at these places, and the context there.
-fn transitions(episodes: &[Episode], places: &[Place]) -> (Table, Table) {
+fn transitions(episodes: &[Episode], places: &[Place]) -> io::Result<(Table, Table)> {
     let dim = episodes.first().map_or(0, |episode| episode.context_dim);
     let (mut features, mut truth) = (Table::new(0), Table::new(dim));
     for (episode, t) in places {
         let episode = &episodes[*episode];
-        let parts = [episode.state(*t), episode.action(*t), &episode.rewards[*t..=*t], episode.state(t + 1)];
+        let (state, action, reward, next) = (episode.state(*t)?, episode.action(*t)?, episode.reward(*t)?, episode.state(t + 1)?);
+        let parts = [&*state, &*action, &[reward], &*next];
         let columns: Vec<f64> = parts.into_iter().flatten().map(|value| f64::from(*value)).collect();
         features.values.extend(&columns);
         features.width = columns.len();
@@ -76,9 +89,9 @@ fn transitions(episodes: &[Episode], places: &[Place]) -> (Table, Table) {
             }
             features.width += columns.len() * (columns.len() + 1) / 2;
         }
-        truth.values.extend(episode.context(*t).iter().map(|value| f64::from(*value)));
+        truth.values.extend(episode.context(*t)?.iter().map(|value| f64::from(*value)));
     }
-    (features, truth)
+    Ok((features, truth))
 }
 
 #[cfg(test)]
@@ -96,7 +109,7 @@ mod tests {
             for t in 0..39 {
                 states.push(0.5 * states[t] + actions[t] + context[t]);
             }
-            Episode { layout: Layout { state_dim: 1, action_dim: 1 }, context_dim: 1, states, actions, rewards, context }
+            Episode::of(Layout { state_dim: 1, action_dim: 1 }, [states, actions, rewards, context])
         };
         (0..count).map(|_| episode()).collect()
     }

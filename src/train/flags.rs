@@ -10,7 +10,7 @@ use std::path::PathBuf;
 ///   ada-trainer inspect runs/point-wind-s
 ///   ada-trainer defaults runs/point-wind-s models/point-wind-s --set sampler.kappa=0.1
 ///
-/// Data sets are HDF5 files in D4RL's layout, for example from `ada-collect`. A run that was stopped (Ctrl-C, kill -9) goes on by
+/// Data sets are HDF5 files in D4RL's layout, for example from `ada-collect`; docs/data.md says what they hold. A run that was stopped (Ctrl-C, kill -9) goes on by
 /// the same command, with the same bits as if it had never stopped.
 #[derive(Parser)]
 #[command(version, verbatim_doc_comment)]
@@ -45,6 +45,10 @@ pub struct Run {
     /// Stop after this many steps as if interrupted; the same command goes on
     #[arg(long, value_name = "N")]
     pub stop_after_steps: Option<usize>,
+    /// Keep the rows of the data set in a file (in OUT/training, gone at the end) if they take more than this; the results are the
+    /// same [default: half of the memory that is free]
+    #[arg(long, value_name = "MIB")]
+    pub data_memory_mib: Option<u64>,
 }
 
 /// Flags of `probe`.
@@ -54,6 +58,9 @@ pub struct Probe {
     pub checkpoint: PathBuf,
     /// HDF5 file with infos/context
     pub data: PathBuf,
+    /// Keep the rows of the data set in a temporary file (in TMPDIR) if they take more than this [default: half of the memory that is free]
+    #[arg(long, value_name = "MIB")]
+    pub data_memory_mib: Option<u64>,
     /// Print JSON instead of a table
     #[arg(long)]
     pub json: bool,

@@ -24,6 +24,7 @@ use crate::model::{config::ModelConfig, diffusion::refine::LatentRouting};
 use anyhow::{Context, Result, bail, ensure};
 use dataset::{
     Split, UnitsFrom, hdf5,
+    room::Room,
     units::{self, ActionColumn},
 };
 use learner::{Learner, Scalars};
@@ -52,6 +53,8 @@ pub struct Options {
     pub stop_after_steps: Option<usize>,
     /// Set by the binary when the user interrupts: the run saves its state and ends after the step in progress.
     pub stop: Arc<AtomicBool>,
+    /// Rows of the data set that take more than this are kept in a file beside the training state; none: half of the memory that is free.
+    pub data_memory_mib: Option<u64>,
     /// The wall clock, for the logs.
     pub clock: Box<Clock>,
 }
@@ -77,6 +80,8 @@ pub struct Task {
     pub dataset_digest: String,
     /// The architecture, without the latent spread, which only training tells.
     pub config: ModelConfig,
+    /// What a person should know about the data.
+    pub notes: Vec<String>,
 }
 
 impl Task {
@@ -84,16 +89,17 @@ impl Task {
     ///
     /// # Errors
     /// If the data set cannot be read or does not fit the recipe.
-    pub fn new(recipe: Recipe) -> Result<Self> {
-        let dataset = hdf5::read(&recipe.data)?;
+    pub fn new(recipe: Recipe, room: &Room) -> Result<Self> {
+        let mut dataset = hdf5::read(&recipe.data, room)?;
         let (len, why) = recipe.episode_len_min();
-        dataset.require_len(len, &why)?;
+        dataset.leave_out_shorter(len, &why)?;
         if recipe.gate.is_some() {
-            ensure!(dataset.context_dim > 0, "recipe: `gate`: {} has no `infos/context` to probe for", recipe.data.display());
+            ensure!(dataset.context_dim() > 0, "recipe: `gate`: {} has no `infos/context` to probe for", recipe.data.display());
         }
+        let (layout, notes, dataset_digest) = (dataset.layout(), std::mem::take(&mut dataset.notes), dataset.digest.clone());
         let (split, action_columns) = dataset.split(UnitsFrom::Data(&recipe.actions))?;
         let config = ModelConfig {
-            layout: dataset.layout,
+            layout,
             plan_horizon: recipe.model.plan_horizon,
             block_len: recipe.model.block_len,
             obs_horizon: recipe.model.obs_horizon,
@@ -112,7 +118,7 @@ impl Task {
             restart: recipe.restart,
             sampler: recipe.sampler.clone(),
         };
-        Ok(Self { recipe, split, action_columns, dataset_digest: dataset.digest, config })
+        Ok(Self { recipe, split, action_columns, dataset_digest, config, notes })
     }
 }
 
@@ -121,8 +127,8 @@ impl Task {
 /// # Errors
 /// If the data set or the recipe is wrong, the gate is never passed, the loss diverges, or the disk refuses.
 pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
-    let task = Task::new(recipe)?;
     let dir = options.out.join(TRAINING_DIR);
+    let task = Task::new(recipe, &Room::new(options.data_memory_mib, dir.clone()))?;
     let _alone = lock(&dir)?;
     let store = Store::new(&dir, Identity { recipe: task.recipe.to_toml(), dataset: task.dataset_digest.clone() });
     let state = store.load()?;
@@ -132,6 +138,7 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
         None => Learner::fresh(&task, 0)?,
     };
     let log = Log::open(&dir, &learner.position, options.clock)?;
+    task.notes.iter().for_each(|note| log.say(note));
     let (train, held_out) = (task.split.train.len(), task.split.held_out.len());
     log.say(&format!("{}: {train} episodes to train on, {held_out} held out", task.recipe.data.display()));
     log.say(&format!("actions: {}", units::summary(&task.recipe.actions, &task.action_columns)));

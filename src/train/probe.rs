@@ -10,6 +10,7 @@ use super::{
 use crate::model::latent::LatentModel;
 use anyhow::{Result, ensure};
 use serde::Serialize;
+use std::io;
 
 /// Rows of one forward.
 const CHUNK: usize = 512;
@@ -55,12 +56,12 @@ pub fn latent_means(latent: &LatentModel, episodes: &[Episode], places: &[Place]
         let mut rows = TokenRows::new(episodes[first.0].layout);
         for (episode, t) in chunk {
             let (episode, t) = (&episodes[*episode], *t as isize);
-            (t - block_len as isize..t).for_each(|past| rows.push(episode, past, Seen::ALL));
+            (t - block_len as isize..t).try_for_each(|past| rows.push(episode, past, Seen::ALL))?;
             if evidence == Evidence::Filter {
-                rows.push(episode, t, Seen::STATE);
+                rows.push(episode, t, Seen::STATE)?;
             } else {
-                rows.push(episode, t, Seen::ALL);
-                rows.push(episode, t + 1, if evidence == Evidence::Successor { Seen::ALL } else { Seen::STATE });
+                rows.push(episode, t, Seen::ALL)?;
+                rows.push(episode, t + 1, if evidence == Evidence::Successor { Seen::ALL } else { Seen::STATE })?;
             }
         }
         let len = block_len + if evidence == Evidence::Filter { 1 } else { 2 };
@@ -114,7 +115,7 @@ pub struct Features<'a> {
 
 impl Features<'_> {
     /// Rows for which `context[t + shift]` exists and t is at least `from`, with that context.
-    fn aligned(&self, shift: i32, from: usize) -> (Table, Table) {
+    fn aligned(&self, shift: i32, from: usize) -> io::Result<(Table, Table)> {
         let dim = self.episodes.first().map_or(0, |episode| episode.context_dim);
         let (mut rows, mut truth) = (Vec::new(), Table::new(dim));
         for (row, (episode, t)) in self.places.iter().enumerate() {
@@ -122,22 +123,25 @@ impl Features<'_> {
             let inside = usize::try_from(at).ok().filter(|at| *at < self.episodes[*episode].len());
             if let Some(at) = inside.filter(|_| *t >= from) {
                 rows.push(row);
-                truth.values.extend(self.episodes[*episode].context(at).iter().map(|value| f64::from(*value)));
+                truth.values.extend(self.episodes[*episode].context(at)?.iter().map(|value| f64::from(*value)));
             }
         }
-        (self.table.select(&rows), truth)
+        Ok((self.table.select(&rows), truth))
     }
 }
 
 /// Fits on `fit`, where the block is whole, and measures on `test`: (error where the block is whole, error over all steps).
-pub fn score(fit: &Features, test: &Features, shift: i32, from: usize, lambda: f64) -> (f64, f64) {
-    let (x, y) = fit.aligned(shift, from);
+///
+/// # Errors
+/// If an episode cannot be read.
+pub fn score(fit: &Features, test: &Features, shift: i32, from: usize, lambda: f64) -> io::Result<(f64, f64)> {
+    let (x, y) = fit.aligned(shift, from)?;
     let ridge = Ridge::fit(&x, &y, lambda);
-    let error = |from: usize| {
-        let (x, y) = test.aligned(shift, from);
-        standardised_error(&ridge.predict(&x), &y)
+    let error = |from: usize| -> io::Result<f64> {
+        let (x, y) = test.aligned(shift, from)?;
+        Ok(standardised_error(&ridge.predict(&x), &y))
     };
-    (error(from), error(0))
+    Ok((error(from)?, error(0)?))
 }
 
 /// Training and held-out episodes of a probe, and how many places of each are used.
@@ -164,10 +168,10 @@ pub fn latent_probe(latent: &LatentModel, subjects: &Subjects, evidence: Evidenc
     };
     let (fit, test) = (features(subjects.train)?, features(subjects.held_out)?);
     let line = |shift: &i32| {
-        let (error, error_all) = score(&fit, &test, *shift, block_len, LAMBDA);
-        Score { source: "latent", evidence, block_len, shift: *shift, error, r2: 1.0 - error, error_all }
+        let (error, error_all) = score(&fit, &test, *shift, block_len, LAMBDA)?;
+        Ok(Score { source: "latent", evidence, block_len, shift: *shift, error, r2: 1.0 - error, error_all })
     };
-    Ok(shifts.iter().map(line).collect())
+    shifts.iter().map(line).collect()
 }
 
 #[cfg(test)]
@@ -182,7 +186,7 @@ mod tests {
         let mut noise = |len: usize| (0..len).map(|_| rng.normal()).collect::<Vec<f32>>();
         let mut episode = || {
             let (states, actions, rewards, context) = (noise(40), noise(40), noise(40), noise(80));
-            Episode { layout, context_dim: 2, states, actions, rewards, context }
+            Episode::of(layout, [states, actions, rewards, context])
         };
         (0..count).map(|_| episode()).collect()
     }
@@ -192,7 +196,7 @@ mod tests {
         let places = places(episodes, usize::MAX);
         let mut table = Table::new(2);
         for (episode, t) in &places {
-            let context = t.checked_sub(1).map_or(&[9.0, 9.0][..], |before| episodes[*episode].context(before));
+            let context = t.checked_sub(1).map_or([9.0, 9.0].as_slice().into(), |before| episodes[*episode].context(before).unwrap());
             let (a, b) = (f64::from(context[0]), f64::from(context[1]));
             table.values.extend([2.0 * a - b + 1.0, a + b]);
         }
@@ -203,9 +207,9 @@ mod tests {
     fn the_probe_finds_the_shift() {
         let (train, held_out) = (episodes(60, 1), episodes(20, 2));
         let (fit, test) = (lagged(&train), lagged(&held_out));
-        let errors = [-1, 0, 1].map(|shift| score(&fit, &test, shift, 1, LAMBDA).0);
+        let errors = [-1, 0, 1].map(|shift| score(&fit, &test, shift, 1, LAMBDA).unwrap().0);
         assert!(errors[0] < 1e-6 && errors[1] > 0.9 && errors[2] > 0.9, "{errors:?}");
-        let (settled, all) = score(&fit, &test, 0, 5, LAMBDA);
+        let (settled, all) = score(&fit, &test, 0, 5, LAMBDA).unwrap();
         assert!(settled != all, "the first steps count in the second number only");
     }
 

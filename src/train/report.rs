@@ -2,7 +2,7 @@
 
 use super::{
     ceiling::ceiling,
-    dataset::{UnitsFrom, hdf5},
+    dataset::{UnitsFrom, hdf5, room::Room},
     probe::{Evidence, Score, Subjects, latent_probe},
 };
 use crate::model::checkpoint;
@@ -14,25 +14,28 @@ use std::path::Path;
 const ROWS: usize = 20_000;
 const SHIFTS: [i32; 3] = [-1, 0, 1];
 
-/// Probes a checkpoint against a data set: block lengths 1, 2, 4 and T_x, every evidence, shifts -1, 0, 1, and the ceiling.
+/// Probes a checkpoint against a data set: block lengths 1, 2, 4 and T_x, every evidence, shifts -1, 0, 1, and the ceiling; and what a
+/// person should know about the data.
 ///
 /// # Errors
 /// If either cannot be read, they do not fit, the model has no latent, or the data no context.
-pub fn probe(dir: &Path, data: &Path) -> Result<Vec<Score>> {
+pub fn probe(dir: &Path, data: &Path, room: &Room) -> Result<(Vec<Score>, Vec<String>)> {
     let agent = checkpoint::load(dir)?;
     let config = agent.config();
     let latent = agent.networks().latent.as_ref().with_context(|| format!("{} has no latent to probe", dir.display()))?;
-    let dataset = hdf5::read(data)?;
+    let mut dataset = hdf5::read(data, room)?;
+    let layout = dataset.layout();
     ensure!(
-        dataset.layout == config.layout,
+        layout == config.layout,
         "{}: {} states and {} actions, but the checkpoint has {} and {}",
         data.display(),
-        dataset.layout.state_dim,
-        dataset.layout.action_dim,
+        layout.state_dim,
+        layout.action_dim,
         config.layout.state_dim,
         config.layout.action_dim
     );
-    dataset.require_len(config.block_len + 2, "the block length")?;
+    dataset.leave_out_shorter(config.block_len + 2, "the block length + 2")?;
+    let notes = std::mem::take(&mut dataset.notes);
     let (split, _) = dataset.split(UnitsFrom::Checkpoint(config))?;
     let subjects = Subjects { train: &split.train, held_out: &split.held_out, rows_max: ROWS };
     let mut block_lens = vec![1, 2, 4, config.block_len];
@@ -46,7 +49,7 @@ pub fn probe(dir: &Path, data: &Path) -> Result<Vec<Score>> {
         }
     }
     scores.extend(ceiling(&subjects, &block_lens)?);
-    Ok(scores)
+    Ok((scores, notes))
 }
 
 /// The probe as a table for people.

@@ -48,7 +48,6 @@ def main() -> None:
     write("no_actions", {key: values for key, values in good.items() if key != "actions"})
     write("ragged", good | {"rewards": good["rewards"][:-3]})
     write("flat", good | {"observations": good["observations"].reshape(-1, 3, 1)})
-    write("whole_numbers", good | {"actions": good["actions"].astype(np.int32)})
     spoiled = good["observations"].copy()
     spoiled[30, 2] = np.nan
     write("nan", good | {"observations": spoiled})

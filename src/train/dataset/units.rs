@@ -3,9 +3,10 @@
 //! A denoiser's noise has standard deviation 1, so an action that moves by .01, or around 101, drowns in it: the same task copied its
 //! expert with an error of .006 in units of [-1, 1], .59 with actions a hundred times smaller, .47 with actions shifted by 101.
 
-use super::DatasetError;
-use crate::model::normalizer::Affine;
+use super::{DatasetError, unreadable};
+use crate::model::normalizer::{Affine, hold_within};
 use serde::{Deserialize, Serialize};
+use std::io;
 
 /// Of this many values one may lie on either side of what counts as usual; never fewer than one.
 const UNUSUAL_EVERY: usize = 1000;
@@ -75,15 +76,19 @@ impl ActionColumn {
     }
 }
 
-/// Chooses bounds and map of every column; `rows` are `(N, dim)`, raw. Bounds are those of the recipe, else the data's, outliers apart.
+/// Shows all rows of a field in order, some at a time.
+type Visit<'a> = &'a mut dyn FnMut(&[f32]);
+
+/// Chooses bounds and map of every one of `dim` columns. Bounds are those of the recipe, else the data's, outliers apart. `scan` shows
+/// raw rows, and is called several times.
 ///
 /// # Errors
-/// If the recipe's bounds are not one for each column, or in the wrong order.
-pub fn fit<'a>(
+/// If the recipe's bounds are not one for each column, or in the wrong order, or rows cannot be read.
+pub fn fit(
     config: &ActionsConfig,
     path: &str,
     dim: usize,
-    rows: impl Iterator<Item = &'a [f32]> + Clone,
+    scan: impl Fn(Visit) -> io::Result<()>,
 ) -> Result<Vec<ActionColumn>, DatasetError> {
     let invalid = |reason: String| DatasetError::Invalid { path: path.into(), field: "actions".into(), reason };
     for (key, given) in [("low", &config.low), ("high", &config.high)] {
@@ -91,26 +96,62 @@ pub fn fit<'a>(
             return Err(invalid(format!("{dim} column(s), but the recipe's `actions.{key}` has {} value(s)", given.len())));
         }
     }
-    let count = rows.clone().count();
-    let column = |j: usize| {
-        let values = rows.clone().map(move |row| row[j]);
-        let (low, high) = usual_limits(values.clone(), count);
-        let (low, high) = (config.low.get(j).copied().unwrap_or(low), config.high.get(j).copied().unwrap_or(high));
+    let limits = limits(dim, &scan).map_err(|error| unreadable(path, &error))?;
+    let low: Vec<f32> = limits.iter().enumerate().map(|(j, limits)| config.low.get(j).copied().unwrap_or(limits.low)).collect();
+    let high: Vec<f32> = limits.iter().enumerate().map(|(j, limits)| config.high.get(j).copied().unwrap_or(limits.high)).collect();
+    for (j, (low, high)) in low.iter().zip(&high).enumerate() {
         if low > high || !low.is_finite() || !high.is_finite() {
             return Err(invalid(format!("column {j}: the recipe's bounds leave nothing between {low} and {high}")));
         }
-        let affine = affine(config.units, values.clone(), (low, high));
-        Ok(ActionColumn {
-            low,
-            high,
-            data_low: values.clone().fold(f32::INFINITY, f32::min),
-            data_high: values.clone().fold(f32::NEG_INFINITY, f32::max),
-            outside: values.filter(|value| !(low..=high).contains(value)).count(),
-            mean: affine.0,
-            scale: affine.1,
-        })
+    }
+    let within = Within { low, high };
+    let (affine, outside) = within.measure(config.units, &scan).map_err(|error| unreadable(path, &error))?;
+    let Within { low, high } = within;
+    let column = |(j, limits): (usize, Limits)| ActionColumn {
+        low: low[j],
+        high: high[j],
+        data_low: limits.least,
+        data_high: limits.greatest,
+        outside: outside[j],
+        mean: affine.mean[j],
+        scale: affine.std[j],
     };
-    (0..dim).map(column).collect()
+    Ok(limits.into_iter().enumerate().map(column).collect())
+}
+
+/// Bounds of all columns.
+struct Within {
+    low: Vec<f32>,
+    high: Vec<f32>,
+}
+
+impl Within {
+    /// The map of each column, and how many of its values lie outside the bounds. A column that never changes keeps its scale.
+    fn measure(&self, units: ActionUnits, scan: &impl Fn(Visit) -> io::Result<()>) -> io::Result<(Affine, Vec<usize>)> {
+        let mut outside = vec![0; self.low.len()];
+        scan(&mut |rows| {
+            for (i, value) in rows.iter().enumerate() {
+                let j = i % self.low.len();
+                outside[j] += usize::from(!(self.low[j]..=self.high[j]).contains(value));
+            }
+        })?;
+        let bounds = || self.low.iter().zip(&self.high);
+        let affine = match units {
+            ActionUnits::AsIs => Affine::identity(self.low.len()),
+            ActionUnits::Limits => Affine {
+                mean: bounds().map(|(low, high)| 0.5 * (low + high)).collect(),
+                std: bounds().map(|(low, high)| 0.5 * (high - low)).map(|scale| if scale.is_normal() { scale } else { 1.0 }).collect(),
+            },
+            ActionUnits::Gaussian => Affine::fit(self.low.len(), |visit| {
+                scan(&mut |rows| {
+                    let mut held = rows.to_vec();
+                    hold_within(&mut held, &self.low, &self.high);
+                    visit(&held);
+                })
+            })?,
+        };
+        Ok((affine, outside))
+    }
 }
 
 /// A line for the log: what the bounds are, and whose units the networks see.
@@ -130,39 +171,40 @@ pub fn affine_of(columns: &[ActionColumn]) -> Affine {
     Affine { mean: columns.iter().map(|column| column.mean).collect(), std: columns.iter().map(|column| column.scale).collect() }
 }
 
-/// Mean and scale of a column; one that never changes keeps its scale.
-fn affine(units: ActionUnits, values: impl Iterator<Item = f32> + Clone, (low, high): (f32, f32)) -> (f32, f32) {
-    let (mean, scale) = match units {
-        ActionUnits::AsIs => return (0.0, 1.0),
-        ActionUnits::Limits => (0.5 * (low + high), 0.5 * (high - low)),
-        ActionUnits::Gaussian => {
-            let within = values.map(|value| f64::from(value.clamp(low, high)));
-            let count = within.clone().count().max(1) as f64;
-            let mean = within.clone().sum::<f64>() / count;
-            (mean as f32, (within.map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt() as f32)
-        }
-    };
-    (mean, if scale.is_normal() { scale } else { 1.0 })
+/// What the values of a column span.
+struct Limits {
+    least: f32,
+    greatest: f32,
+    low: f32,
+    high: f32,
 }
 
-/// Least and greatest of the values, but for those that lie far outside the range of nearly all: one broken reading must not squeeze
-/// everything else into a corner. Where nearly all are equal, the rare others are what the column says, and all count.
-fn usual_limits(values: impl Iterator<Item = f32>, count: usize) -> (f32, f32) {
+fn limits(dim: usize, scan: &impl Fn(Visit) -> io::Result<()>) -> io::Result<Vec<Limits>> {
+    let mut count = 0;
+    scan(&mut |rows| count += rows.len() / dim.max(1))?;
     let keep = (count / UNUSUAL_EVERY).max(1) + 1;
-    let (mut lowest, mut highest) = (Tail::new(keep, |a, b| a.total_cmp(b)), Tail::new(keep, |a, b| b.total_cmp(a)));
-    for value in values {
-        lowest.push(value);
-        highest.push(value);
-    }
-    let (lowest, highest) = (lowest.sorted(), highest.sorted());
+    let mut tails: Vec<[Tail; 2]> =
+        (0..dim).map(|_| [Tail::new(keep, |a, b| a.total_cmp(b)), Tail::new(keep, |a, b| b.total_cmp(a))]).collect();
+    scan(&mut |rows| {
+        for (i, value) in rows.iter().enumerate() {
+            tails[i % dim].iter_mut().for_each(|tail| tail.push(*value));
+        }
+    })?;
+    Ok(tails.into_iter().map(|[lowest, highest]| usual(&lowest.sorted(), &highest.sorted())).collect())
+}
+
+/// Least and greatest of the values, and the same but for those that lie far outside the range of nearly all: one broken reading must not
+/// squeeze everything else into a corner. Where nearly all are equal, the rare others are what the column says, and all count. `lowest`
+/// and `highest` are the least and the greatest values, the outermost first.
+fn usual(lowest: &[f32], highest: &[f32]) -> Limits {
     let edge = |tail: &[f32]| [tail.first(), tail.last()].map(|value| value.copied().unwrap_or(0.0));
-    let ([least, low], [greatest, high]) = (edge(&lowest), edge(&highest));
+    let ([least, low], [greatest, high]) = (edge(lowest), edge(highest));
     if high <= low {
-        return (least, greatest);
+        return Limits { least, greatest, low: least, high: greatest };
     }
     let (bottom, top) = (low - FENCE * (high - low), high + FENCE * (high - low));
-    let first = |tail: Vec<f32>, otherwise: f32| tail.into_iter().find(|value| (bottom..=top).contains(value)).unwrap_or(otherwise);
-    (first(lowest, low), first(highest, high))
+    let first = |tail: &[f32], otherwise| tail.iter().copied().find(|value| (bottom..=top).contains(value)).unwrap_or(otherwise);
+    Limits { least, greatest, low: first(lowest, low), high: first(highest, high) }
 }
 
 /// The first so many values of a sequence in some order.
@@ -197,8 +239,13 @@ mod tests {
     use super::*;
     use crate::model::noise::Philox;
 
+    /// A scan of a few rows at a time.
+    fn shown(values: &[f32]) -> impl Fn(Visit) -> io::Result<()> {
+        |visit| Ok(values.chunks(7).for_each(visit))
+    }
+
     fn columns(config: &ActionsConfig, values: &[f32]) -> ActionColumn {
-        fit(config, "test", 1, values.chunks(1)).unwrap().remove(0)
+        fit(config, "test", 1, shown(values)).unwrap().remove(0)
     }
 
     fn uniform(count: usize, low: f32, high: f32) -> Vec<f32> {
@@ -248,7 +295,7 @@ mod tests {
         let gaussian = columns(&ActionsConfig { units: ActionUnits::Gaussian, ..ActionsConfig::default() }, &uniform(10_000, 0.0, 0.12));
         assert!((gaussian.mean - 0.06).abs() < 1e-3 && (gaussian.scale - 0.12 / 12_f32.sqrt()).abs() < 1e-3, "{gaussian:?}");
         let wrong = ActionsConfig { low: vec![0.0, 1.0], ..ActionsConfig::default() };
-        assert!(fit(&wrong, "test", 1, [1.0_f32].chunks(1)).unwrap_err().to_string().contains("`actions.low` has 2 value(s)"));
+        assert!(fit(&wrong, "test", 1, shown(&[1.0])).unwrap_err().to_string().contains("`actions.low` has 2 value(s)"));
     }
 
     #[test]

@@ -8,6 +8,7 @@ use crate::model::{
     trajectory::Layout,
 };
 use candle_core::{Device, Result, Tensor};
+use std::io;
 
 /// Which parts of a token are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,14 +51,18 @@ impl TokenRows {
     }
 
     /// Appends x_t of an episode, wholly absent where `t` lies outside of it.
-    pub fn push(&mut self, episode: &Episode, t: isize, seen: Seen) {
+    ///
+    /// # Errors
+    /// If the episode cannot be read.
+    pub fn push(&mut self, episode: &Episode, t: isize, seen: Seen) -> io::Result<()> {
         let inside = usize::try_from(t).ok().filter(|t| *t < episode.len());
         let flags = if inside.is_some() { seen.flags() } else { Seen::NOTHING.flags() };
         self.present.extend(flags);
         let t = inside.unwrap_or(0);
-        self.state.extend(episode.state(t).iter().map(|value| value * flags[0]));
-        self.action.extend(episode.action(t).iter().map(|value| value * flags[1]));
-        self.reward.push(episode.rewards[t] * flags[2]);
+        self.state.extend(episode.state(t)?.iter().map(|value| value * flags[0]));
+        self.action.extend(episode.action(t)?.iter().map(|value| value * flags[1]));
+        self.reward.push(episode.reward(t)? * flags[2]);
+        Ok(())
     }
 
     /// Rows of `len` tokens each.
@@ -78,21 +83,28 @@ impl TokenRows {
 }
 
 /// All places where a piece may begin: (episode, first step), equally likely.
-pub struct Places(Vec<(u32, i32)>);
+pub struct Places {
+    /// Places up to and with each episode.
+    ends: Vec<usize>,
+    before: usize,
+}
 
 impl Places {
     /// From `before` steps before each episode's start up to the last place where `len` steps still fit.
     pub fn new(episodes: &[Episode], before: usize, len: usize) -> Self {
-        let of = |(index, episode): (usize, &Episode)| {
-            let end = episode.len() as i32 - len as i32;
-            (-(before as i32)..=end).map(move |start| (index as u32, start))
-        };
-        Self(episodes.iter().enumerate().flat_map(of).collect())
+        let count = |episode: &Episode| (episode.len() + before + 1).saturating_sub(len);
+        let ends = episodes.iter().scan(0, |sum, episode| {
+            *sum += count(episode);
+            Some(*sum)
+        });
+        Self { ends: ends.collect(), before }
     }
 
     fn draw(&self, rng: &mut Philox) -> (usize, isize) {
-        let (episode, start) = self.0[rng.below(self.0.len())];
-        (episode as usize, start as isize)
+        let drawn = rng.below(self.ends.last().copied().unwrap_or(0));
+        let episode = self.ends.partition_point(|end| *end <= drawn);
+        let first = episode.checked_sub(1).map_or(0, |before| self.ends[before]);
+        (episode, (drawn - first) as isize - self.before as isize)
     }
 }
 
@@ -118,7 +130,7 @@ pub struct BlockShape {
 /// Draws a batch of blocks; `places` must be made for this shape.
 ///
 /// # Errors
-/// Never for episodes of one layout.
+/// If an episode cannot be read.
 pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &mut Philox) -> Result<ElboBatch> {
     let steps = shape.len - 1;
     let mut rows = TokenRows::new(episodes[0].layout);
@@ -128,7 +140,7 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
         let (episode, start) = places.draw(rng);
         let hidden = shape.hide.draw(rng);
         for t in start..start + shape.len as isize {
-            rows.push(&episodes[episode], t, Seen::ALL);
+            rows.push(&episodes[episode], t, Seen::ALL)?;
             history.extend(hidden.step(rng).flags());
         }
         for t in start..start + steps as isize {
@@ -209,7 +221,7 @@ impl WindowShape {
 /// Draws a batch of windows; `row` fixes the ladder row of all of them (measurement) instead of drawing it (training).
 ///
 /// # Errors
-/// Never for episodes of one layout.
+/// If an episode cannot be read.
 pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: Option<usize>, rng: &mut Philox) -> Result<WindowBatch> {
     let layout = episodes[0].layout;
     let mut history = TokenRows::new(layout);
@@ -223,13 +235,13 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
         for (back, seen) in shape.seen(imagined, rng).into_iter().enumerate().rev() {
             let (t, back) = (start - 1 - back as isize, back + 1);
             if back <= shape.block_len {
-                history.push(episode, t, seen);
+                history.push(episode, t, seen)?;
             }
             if back < shape.obs_horizon {
-                push_step(&mut observed, episode, t, seen);
+                push_step(&mut observed, episode, t, seen)?;
             }
         }
-        (start..start + shape.plan_horizon as isize).for_each(|t| push_step(&mut window, episode, t, Seen::ALL));
+        (start..start + shape.plan_horizon as isize).try_for_each(|t| push_step(&mut window, episode, t, Seen::ALL))?;
         rows.push(row.unwrap_or(drawn));
         inpaint.push(imagined == 0);
     }
@@ -250,14 +262,17 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
 }
 
 /// (s_t, a_t), zeros for what is not seen and before the start.
-fn push_step(out: &mut Vec<f32>, episode: &Episode, t: isize, seen: Seen) {
-    let Layout { state_dim, action_dim } = episode.layout;
-    let (t, inside) = (usize::try_from(t).unwrap_or(0), t >= 0);
-    let mut part = |shown: bool, values: &[f32], width: usize| {
-        if shown && inside { out.extend_from_slice(values) } else { out.extend(std::iter::repeat_n(0.0, width)) }
-    };
-    part(seen.state, episode.state(t), state_dim);
-    part(seen.action, episode.action(t), action_dim);
+fn push_step(out: &mut Vec<f32>, episode: &Episode, t: isize, seen: Seen) -> io::Result<()> {
+    let (Layout { state_dim, action_dim }, inside) = (episode.layout, usize::try_from(t).ok());
+    match inside.filter(|_| seen.state) {
+        Some(t) => out.extend_from_slice(&episode.state(t)?),
+        None => out.extend(std::iter::repeat_n(0.0, state_dim)),
+    }
+    match inside.filter(|_| seen.action) {
+        Some(t) => out.extend_from_slice(&episode.action(t)?),
+        None => out.extend(std::iter::repeat_n(0.0, action_dim)),
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -268,13 +283,10 @@ mod tests {
 
     /// Every number says where it comes from: states 100 e + t and its negative, actions t / 10, rewards -t.
     fn episodes() -> Vec<Episode> {
-        let episode = |index: usize, len: usize| Episode {
-            layout: LAYOUT,
-            context_dim: 0,
-            states: (0..len).flat_map(|t| [(100 * index + t) as f32, -((100 * index + t) as f32)]).collect(),
-            actions: (0..len).map(|t| t as f32 / 10.0).collect(),
-            rewards: (0..len).map(|t| -(t as f32)).collect(),
-            context: Vec::new(),
+        let episode = |index: usize, len: usize| {
+            let states = (0..len).flat_map(|t| [(100 * index + t) as f32, -((100 * index + t) as f32)]).collect();
+            let (actions, rewards) = ((0..len).map(|t| t as f32 / 10.0).collect(), (0..len).map(|t| -(t as f32)).collect());
+            Episode::of(LAYOUT, [states, actions, rewards, Vec::new()])
         };
         vec![episode(1, 9), episode(2, 12)]
     }

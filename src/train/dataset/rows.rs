@@ -1,0 +1,309 @@
+//! The rows of a data set, in memory or, where they take more than that, in a file that is read piece by piece. Who draws from them
+//! cannot tell which: the same numbers come, bit for bit.
+
+use super::room::Room;
+use crate::model::{
+    normalizer::{Affine, hold_within},
+    trajectory::Layout,
+};
+use std::{
+    borrow::Cow,
+    fs::{self, File},
+    io::{self, BufWriter, Write},
+    ops::Range,
+    os::unix::fs::FileExt,
+    sync::Arc,
+};
+
+/// Rows that a scan takes at a time.
+const SCAN_ROWS: usize = 1 << 14;
+
+/// One array of a data set: rows of `width` numbers.
+#[derive(Debug)]
+pub struct Field {
+    width: usize,
+    home: Home,
+    /// What rows of a file still have to go through.
+    units: Option<Map>,
+}
+
+/// From raw units to those of the networks.
+#[derive(Debug)]
+struct Map {
+    affine: Affine,
+    /// Where columns are held, raw units.
+    bounds: Option<Bounds>,
+}
+
+/// Lower and upper bound of each column.
+pub type Bounds = (Vec<f32>, Vec<f32>);
+
+impl Map {
+    fn apply(&self, rows: &mut [f32]) {
+        if let Some((low, high)) = &self.bounds {
+            hold_within(rows, low, high);
+        }
+        self.affine.normalize_in_place(rows);
+    }
+}
+
+/// Where the rows are.
+#[derive(Debug)]
+enum Home {
+    Memory(Vec<f32>),
+    /// Little-endian numbers; the file has no name any more and goes with the process.
+    File(File),
+}
+
+impl Field {
+    /// Rows in memory.
+    pub fn in_memory(width: usize, values: Vec<f32>) -> Self {
+        Self { width, home: Home::Memory(values), units: None }
+    }
+
+    /// Numbers in a row.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// The rows in `range`, `(len, width)`.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    pub fn rows(&self, range: Range<usize>) -> io::Result<Cow<'_, [f32]>> {
+        let numbers = range.start * self.width..range.end * self.width;
+        match &self.home {
+            Home::Memory(values) => Ok(Cow::Borrowed(&values[numbers])),
+            Home::File(file) => {
+                let mut bytes = vec![0; 4 * numbers.len()];
+                let read = file.read_exact_at(&mut bytes, 4 * numbers.start as u64);
+                read.map_err(|error| io::Error::new(error.kind(), format!("rows of the data set that are kept in a file: {error}")))?;
+                let mut values: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+                if let Some(units) = &self.units {
+                    units.apply(&mut values);
+                }
+                Ok(Cow::Owned(values))
+            }
+        }
+    }
+
+    /// The same rows held within `bounds`, if any, and in other units: at once in memory, on each read from a file.
+    pub fn normalized(mut self, affine: Affine, bounds: Option<Bounds>) -> Self {
+        let map = Map { affine, bounds };
+        match &mut self.home {
+            Home::Memory(values) => map.apply(values),
+            Home::File(_) => self.units = Some(map),
+        }
+        self
+    }
+
+    /// Shows all rows of these ranges in order, some at a time.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    pub fn scan(&self, spans: impl Iterator<Item = Range<usize>>, visit: &mut dyn FnMut(&[f32])) -> io::Result<()> {
+        spans.flat_map(|span| pieces(span, SCAN_ROWS)).try_for_each(|piece| {
+            visit(&self.rows(piece)?);
+            Ok(())
+        })
+    }
+
+    /// Shows how each row differs from the one before it, within each range.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    pub fn scan_changes(&self, spans: impl Iterator<Item = Range<usize>>, visit: &mut dyn FnMut(&[f32])) -> io::Result<()> {
+        let seconds = spans.map(|span| span.start + 1..span.end.max(span.start + 1));
+        seconds.flat_map(|span| pieces(span, SCAN_ROWS)).try_for_each(|piece| {
+            let rows = self.rows(piece.start - 1..piece.end)?;
+            let changes: Vec<f32> = rows[self.width..].iter().zip(&*rows).map(|(next, now)| next - now).collect();
+            visit(&changes);
+            Ok(())
+        })
+    }
+}
+
+/// `span` in pieces of at most `len`.
+pub fn pieces(span: Range<usize>, len: usize) -> impl Iterator<Item = Range<usize>> {
+    span.clone().step_by(len).map(move |start| start..span.end.min(start + len))
+}
+
+/// A field under construction, row after row.
+pub struct FieldWriter {
+    width: usize,
+    home: HomeWriter,
+}
+
+enum HomeWriter {
+    Memory(Vec<f32>),
+    File(BufWriter<File>),
+}
+
+impl FieldWriter {
+    /// A field of `rows` rows, in memory or in a file in the room's scratch folder.
+    ///
+    /// # Errors
+    /// If the file cannot be made.
+    pub fn new(width: usize, rows: usize, room: &Room, in_file: bool) -> io::Result<Self> {
+        if !in_file {
+            return Ok(Self { width, home: HomeWriter::Memory(Vec::with_capacity(width * rows)) });
+        }
+        fs::create_dir_all(&room.scratch)?;
+        Ok(Self { width, home: HomeWriter::File(BufWriter::new(tempfile::tempfile_in(&room.scratch)?)) })
+    }
+
+    /// Appends rows.
+    ///
+    /// # Errors
+    /// If the disk is full.
+    pub fn push(&mut self, values: &[f32]) -> io::Result<()> {
+        match &mut self.home {
+            HomeWriter::Memory(all) => all.extend_from_slice(values),
+            HomeWriter::File(file) => values.iter().try_for_each(|value| file.write_all(&value.to_le_bytes()))?,
+        }
+        Ok(())
+    }
+
+    /// The field.
+    ///
+    /// # Errors
+    /// If the disk is full.
+    pub fn finish(self) -> io::Result<Field> {
+        let home = match self.home {
+            HomeWriter::Memory(values) => Home::Memory(values),
+            HomeWriter::File(file) => Home::File(file.into_inner()?),
+        };
+        Ok(Field { width: self.width, home, units: None })
+    }
+}
+
+/// The arrays of a data set, all with the same number of rows.
+#[derive(Debug)]
+pub struct Fields {
+    /// `(N, state_dim)`.
+    pub states: Field,
+    /// `(N, action_dim)`.
+    pub actions: Field,
+    /// `(N, 1)`: reward of executing a_t in s_t.
+    pub rewards: Field,
+    /// `(N, context_dim)`: the hidden truth while a_t is executed; seen by the probe alone, never by training. Width 0 where there is none.
+    pub context: Field,
+}
+
+impl Fields {
+    /// Widths of states and actions.
+    pub fn layout(&self) -> Layout {
+        Layout { state_dim: self.states.width, action_dim: self.actions.width }
+    }
+}
+
+/// One episode: consecutive rows.
+#[derive(Clone, Debug)]
+pub struct Episode {
+    /// Widths of states and actions.
+    pub layout: Layout,
+    /// Width of the context; 0 where the file has none.
+    pub context_dim: usize,
+    fields: Arc<Fields>,
+    span: Range<usize>,
+}
+
+impl Episode {
+    /// The rows of `span`.
+    pub fn new(fields: &Arc<Fields>, span: Range<usize>) -> Self {
+        Self { layout: fields.layout(), context_dim: fields.context.width, fields: fields.clone(), span }
+    }
+
+    /// An episode of its own from states, actions, rewards and context.
+    #[cfg(test)]
+    pub fn of(layout: Layout, [states, actions, rewards, context]: [Vec<f32>; 4]) -> Self {
+        let (len, context_dim) = (rewards.len(), context.len() / rewards.len());
+        let fields = Fields {
+            states: Field::in_memory(layout.state_dim, states),
+            actions: Field::in_memory(layout.action_dim, actions),
+            rewards: Field::in_memory(1, rewards),
+            context: Field::in_memory(context_dim, context),
+        };
+        Self::new(&Arc::new(fields), 0..len)
+    }
+
+    /// Number of steps.
+    pub fn len(&self) -> usize {
+        self.span.len()
+    }
+
+    /// Whether there are no steps.
+    pub fn is_empty(&self) -> bool {
+        self.span.is_empty()
+    }
+
+    fn row<'a>(&self, field: &'a Field, t: usize) -> io::Result<Cow<'a, [f32]>> {
+        assert!(t < self.len(), "a step outside of the episode: is a bug");
+        field.rows(self.span.start + t..self.span.start + t + 1)
+    }
+
+    /// s_t.
+    ///
+    /// # Errors
+    /// If rows are kept in a file and it cannot be read.
+    pub fn state(&self, t: usize) -> io::Result<Cow<'_, [f32]>> {
+        self.row(&self.fields.states, t)
+    }
+
+    /// a_t.
+    ///
+    /// # Errors
+    /// As of [`Self::state`].
+    pub fn action(&self, t: usize) -> io::Result<Cow<'_, [f32]>> {
+        self.row(&self.fields.actions, t)
+    }
+
+    /// r_t.
+    ///
+    /// # Errors
+    /// As of [`Self::state`].
+    pub fn reward(&self, t: usize) -> io::Result<f32> {
+        Ok(self.row(&self.fields.rewards, t)?[0])
+    }
+
+    /// The context at t.
+    ///
+    /// # Errors
+    /// As of [`Self::state`].
+    pub fn context(&self, t: usize) -> io::Result<Cow<'_, [f32]>> {
+        self.row(&self.fields.context, t)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The same rows in memory and in a file: pieces, changes and normalized numbers have the same bits, and the file has no name.
+    #[test]
+    fn a_file_is_read_as_memory_is() {
+        let scratch = tempfile::tempdir().unwrap();
+        let room = Room { memory_bytes: 0, scratch: scratch.path().join("deeper") };
+        let values: Vec<f32> = (0..3 * 50_000).map(|i| (i as f32 * 0.37).sin() * 1e3).collect();
+        let affine = Affine { mean: vec![0.1, -3.0, 7.0], std: vec![0.3, 11.0, 1e-3] };
+        let field = |in_file: bool| {
+            let mut writer = FieldWriter::new(3, 50_000, &room, in_file).unwrap();
+            values.chunks(3 * 999).for_each(|rows| writer.push(rows).unwrap());
+            writer.finish().unwrap()
+        };
+        let bits = |field: &Field| {
+            let mut seen: Vec<u32> = field.rows(7..9).unwrap().iter().map(|value| value.to_bits()).collect();
+            let mut visit = |rows: &[f32]| seen.extend(rows.iter().map(|value| value.to_bits()));
+            let spans = [0..1, 3..40_000, 40_000..50_000];
+            field.scan(spans.iter().cloned(), &mut visit).unwrap();
+            field.scan_changes(spans.iter().cloned(), &mut visit).unwrap();
+            seen
+        };
+        let (memory, file) = (field(false), field(true));
+        assert_eq!(bits(&memory).len(), 3 * (2 + 49_998 + 49_998 - 3));
+        assert!(bits(&memory) == bits(&file));
+        let (memory, file) = (memory.normalized(&affine), file.normalized(&affine));
+        assert!(bits(&memory) == bits(&file));
+        assert_eq!(fs::read_dir(&room.scratch).unwrap().count(), 0);
+    }
+}
