@@ -56,7 +56,7 @@ pub struct Recipe {
     pub name: String,
     /// Training seed: initial weights and batches.
     pub seed: u64,
-    /// D4RL HDF5 file, relative to the working directory.
+    /// HDF5 file in D4RL's layout (docs/data.md), relative to the working directory.
     pub data: PathBuf,
     /// Steps between two checkpoints.
     pub checkpoint_every: usize,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -439,3 +440,60 @@ def test_rows_in_a_file_give_the_same_log(plain, tmp_path):
     done = train(data, out, "--data-memory-mib", "0", *few)
     assert done.returncode == 0 and "more than --data-memory-mib allows (0): kept in a file" in done.stderr, done.stderr
     assert (out / "training/log.jsonl").read_text() == plain
+
+
+def example(title: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Runs the example of docs/data.md that stands under a title, in a folder."""
+    text = (ROOT / "docs/data.md").read_text(encoding="utf-8")
+    code = text.split(f"\n{title} ", 1)[1].split("```python\n", 1)[1].split("```", 1)[0]
+    return subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=True)
+
+
+def episodes_of(columns: Arrays) -> list[Arrays]:
+    return [{name: values[at : at + STEPS] for name, values in columns.items()} for at in range(0, ROWS, STEPS)]
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory) -> str:
+    """The log of the plain file without context, which other layouts do not have."""
+    folder = tmp_path_factory.mktemp("blind")
+    columns = arrays()
+    del columns["infos/context"]
+    return log(write(folder / "blind.h5", columns), folder / "out")
+
+
+def test_the_way_out_of_minari(blind, tmp_path):
+    with h5py.File(tmp_path / "main_data.hdf5", "w") as file:
+        for index, steps in enumerate(episodes_of(arrays())):
+            episode = file.create_group(f"episode_{index}")
+            episode["observations"] = np.vstack([steps["observations"], np.full((1, 3), 99)])
+            episode["actions"], episode["rewards"] = steps["actions"], steps["rewards"]
+            episode["terminations"], episode["truncations"] = steps["terminals"], steps["timeouts"]
+    example("Minari", tmp_path)
+    assert log(tmp_path / "data.h5", tmp_path / "out") == blind
+
+
+def test_the_way_out_of_robomimic(blind, tmp_path):
+    with h5py.File(tmp_path / "demo.hdf5", "w") as file:
+        for index, steps in enumerate(episodes_of(arrays())):
+            demo = file.create_group(f"data/demo_{index}")
+            for column, key in enumerate(["robot0_eef_pos", "robot0_eef_quat", "object"]):
+                demo[f"obs/{key}"] = steps["observations"][:, column : column + 1]
+            demo["actions"], demo["rewards"] = steps["actions"], steps["rewards"]
+            demo["dones"] = steps["terminals"].astype(np.int64)
+    example("robomimic", tmp_path)
+    assert log(tmp_path / "data.h5", tmp_path / "out") == blind
+
+
+def test_the_way_out_of_lerobot(tmp_path):
+    arrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = arrays()
+    (tmp_path / "lerobot/data/chunk-000").mkdir(parents=True)
+    for index, steps in enumerate(episodes_of(columns)):
+        table = {"observation.state": list(steps["observations"]), "action": list(steps["actions"]), "episode_index": [index] * STEPS}
+        parquet.write_table(arrow.table(table), tmp_path / f"lerobot/data/chunk-000/episode_{index:06d}.parquet")
+    example("LeRobot", tmp_path)
+    ends = columns["terminals"] | columns["timeouts"]
+    same = {"observations": columns["observations"], "actions": columns["actions"], "rewards": np.zeros(ROWS, "f4"), "terminals": ends}
+    assert log(tmp_path / "data.h5", tmp_path / "a") == log(write(tmp_path / "same.h5", same), tmp_path / "b")
