@@ -302,7 +302,8 @@ mod tests {
         let (memory, file) = (field(false), field(true));
         assert_eq!(bits(&memory).len(), 3 * (2 + 49_998 + 49_998 - 3));
         assert!(bits(&memory) == bits(&file));
-        let (memory, file) = (memory.normalized(&affine), file.normalized(&affine));
+        let bounds = Some((vec![1.0; affine.dim()], vec![9.0; affine.dim()]));
+        let (memory, file) = (memory.normalized(affine.clone(), bounds.clone()), file.normalized(affine, bounds));
         assert!(bits(&memory) == bits(&file));
         assert_eq!(fs::read_dir(&room.scratch).unwrap().count(), 0);
     }
