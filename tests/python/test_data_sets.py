@@ -497,3 +497,25 @@ def test_the_way_out_of_lerobot(tmp_path):
     ends = columns["terminals"] | columns["timeouts"]
     same = {"observations": columns["observations"], "actions": columns["actions"], "rewards": np.zeros(ROWS, "f4"), "terminals": ends}
     assert log(tmp_path / "data.h5", tmp_path / "a") == log(write(tmp_path / "same.h5", same), tmp_path / "b")
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1 / 128, 0), (1, 100), (4096, -(2**20))])
+def test_actions_in_another_unit_train_the_same_bits(plain: str, tmp_path: Path, scale: float, shift: float) -> None:
+    """Bounds began at -1 and 1 and only grew: actions a hundred times smaller were learnt with an error of .59 instead of .006, in silence."""
+    columns = arrays()
+    columns["actions"] = (columns["actions"] * scale + shift).astype(np.float32)
+    assert log(write(tmp_path / "other.h5", columns), tmp_path / "out") == plain
+    done = train(tmp_path / "other.h5", tmp_path / "out2", "--set", "stage1.steps=1", "--set", "stage2.steps=1")
+    low, high = float(shift), float(shift + scale)
+    assert f"actions: bounds [{low}, {low}] .. [{high}, {high}], to -1 .. 1" in done.stderr
+    warned = "warning: actions, column 1: is scaled by" in done.stderr
+    assert warned == (not 0.1 <= scale / 2 <= 10)
+
+
+def test_one_broken_reading_is_counted_and_held(tmp_path: Path) -> None:
+    columns = arrays()
+    columns["actions"] = np.linspace(-1, 1, 2 * ROWS).reshape(ROWS, 2).astype(np.float32)
+    columns["actions"][5, 0] = 1e6
+    done = train(write(tmp_path / "broken.h5", columns), tmp_path / "out", "--set", "stage1.steps=1", "--set", "stage2.steps=1")
+    assert done.returncode == 0, done.stderr
+    assert "column 0: reaches from" in done.stderr and "1 value(s) are held within the bounds" in done.stderr
