@@ -68,7 +68,7 @@ fn act(c: &mut Criterion) {
         let agent = Agent::new(config.clone(), frozen(&config), "bench".into());
         for streaming in [true, false] {
             let episode = agent.open(1, &SamplerOptions { streaming, ..config.sampler.clone() }).expect("opens");
-            let observation = Observation { state: vec![0.1; STATE], executed: Vec::new() };
+            let observation = Observation { state: vec![0.1; STATE], ..Observation::default() };
             let (episode, _) = agent.act(&episode, &observation).expect("acts");
             let kind = if streaming { "streaming" } else { "cold" };
             c.bench_function(&format!("act/{name}/{kind}"), |b| b.iter(|| black_box(agent.act(&episode, &observation).expect("acts"))));

@@ -98,7 +98,7 @@ impl Session {
 
     /// The next act; the same again, so that a retry is one, until it is settled as done.
     pub fn request(&self) -> pb::ActRequest {
-        let observation = pb::Observation { state: self.state.clone(), executed: Vec::new() };
+        let observation = pb::Observation { state: self.state.clone(), ..Default::default() };
         pb::ActRequest {
             session_id: self.id.clone(),
             step: self.committed + 1,

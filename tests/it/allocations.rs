@@ -56,7 +56,7 @@ fn agent(denoiser: DenoiserConfig, obs_horizon: usize) -> Agent {
 
 /// The next acts of a batch of sessions.
 fn descents(agent: &Agent, episodes: &[Episode]) -> Vec<Descent> {
-    let observation = Observation { state: vec![0.3, -0.2, 0.1], executed: Vec::new() };
+    let observation = Observation { state: vec![0.3, -0.2, 0.1], ..Observation::default() };
     episodes.iter().map(|episode| agent.begin(episode, &observation).unwrap()).collect()
 }
 
@@ -83,7 +83,7 @@ fn a_tick_allocates_nothing() {
         };
         let opened: Vec<Episode> = (0..9).map(|i| agent.open(i, &options(i)).unwrap()).collect();
         // Streaming sessions have a window to noise again, the others start cold.
-        let observation = Observation { state: vec![0.1, 0.2, 0.3], executed: Vec::new() };
+        let observation = Observation { state: vec![0.1, 0.2, 0.3], ..Observation::default() };
         let episodes: Vec<Episode> = opened.iter().map(|episode| agent.act(episode, &observation).unwrap().0).collect();
         let starts: Vec<Start> = episodes.iter().map(|episode| agent.act(episode, &observation).unwrap().1.start).collect();
         assert!(starts.contains(&Start::Cold) && starts.contains(&Start::Renoised(2)), "{starts:?}");

@@ -89,5 +89,5 @@ fn what_follows(agent: &Agent, act: usize, chunk: &Chunk, stream: &mut Philox) -
     let reward = agent.config().normalizer.reward.mean[0] + stream.normal();
     let step = |action: &Vec<f32>| Executed { reward: Some(reward), action: (act % 3 == 2).then(|| action.clone()), state: None };
     let executed = if act % 5 == 0 { Vec::new() } else { chunk.actions.iter().map(step).collect() };
-    Observation { state, executed }
+    Observation { state, executed, ..Observation::default() }
 }

@@ -205,6 +205,43 @@ def test_the_broker_over_steps_equals_acting_by_hand(client: Client) -> None:
     assert np.array_equal(np.array(actions), by_hand)
 
 
+def test_a_plan_that_nobody_executed_leaves_no_trace(client: Client) -> None:
+    """`replan()` before the first action of a chunk told the server that the whole chunk had been executed, for want of words."""
+    options = SamplerOptions(action_horizon=2, streaming=False)
+    with client.open_session(seed=4, options=options) as session:
+        expected = [substance(chunk)[:-1] for chunk in drive(session, 2)]
+    with client.open_session(seed=4, options=options) as session:
+        session.act(STATES[7])
+        assert substance(session.act(STATES[0], nothing_executed=True))[:-1] == expected[0]
+        with pytest.raises(InvalidInput) as caught:
+            session.act(STATES[1], [Executed()], nothing_executed=True)
+        assert caught.value.field == "observation.nothing_executed"
+        assert substance(session.act(STATES[1], reward=-0.1))[:-1] == expected[1]
+    with client.open_session(seed=4, options=options) as session:
+        broker = ChunkBroker(session)
+        broker.accept(session.act(STATES[7]))
+        broker.replan()
+        broker.action(STATES[0])
+        broker.report(reward=-0.1)
+        for _ in range(2):  # the second one replaces the first
+            broker.replan()
+            (answer,) = client.act_batch([(session, broker.observation(STATES[1]))])
+            assert isinstance(answer, Chunk)
+            broker.accept(answer)
+        assert substance(answer)[:-1] == expected[1] and session.committed_step == 4
+
+
+def test_a_session_catches_up_after_a_break(client: Client) -> None:
+    """More steps than were returned are a past like any other; a new session is primed by the same."""
+    driven = [Executed(STATES[i], [0.1 * i, -0.1], 0.5) for i in range(5)]
+    with client.open_session(seed=4) as session:
+        session.act(STATES[0])
+        caught_up = session.act(STATES[5], driven)
+    with client.open_session(seed=4) as session:
+        primed = session.act(STATES[5], driven)
+    assert substance(caught_up)[:-1] == substance(primed)[:-1]
+
+
 def test_a_reset_is_a_new_session(client: Client) -> None:
     with client.open_session(seed=1) as session:
         first = [substance(chunk) for chunk in drive(session, 3)]

@@ -41,12 +41,12 @@ class ChunkBroker:
         """The action for this state, `(action_dim,)`; acts if it is due."""
         if self.due:
             observation = self.observation(state)
-            self.accept(self.session.act(observation.state, observation.executed))
+            self.accept(self.session.act(observation.state, observation.executed, nothing_executed=observation.nothing_executed))
         return self.take(state)
 
     def observation(self, state: ArrayLike) -> Observation:
         """What an act at this state has to tell."""
-        return Observation(state, tuple(self._executed))
+        return Observation(state, tuple(self._executed), nothing_executed=self.chunk is not None and not self._executed)
 
     def accept(self, chunk: Chunk) -> None:
         """The answer of the act that was due."""
@@ -74,7 +74,7 @@ class ChunkBroker:
         self._executed[-1] = Executed(last.state, done, last.reward if reward is None else float(reward))
 
     def replan(self) -> None:
-        """Drops the rest of the chunk: the next action comes from a new act."""
+        """Drops the rest of the chunk, or all of it: the next action comes from a new act, which is told what was executed."""
         if self.chunk is not None:
             self._next = len(self.chunk.actions)
 

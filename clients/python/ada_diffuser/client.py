@@ -202,6 +202,7 @@ class Session:
         executed: Sequence[Executed] = (),
         *,
         reward: float | Sequence[float] | None = None,
+        nothing_executed: bool = False,
         deadline_ms: int | None = None,
         planned_states: bool = False,
     ) -> Chunk:
@@ -209,12 +210,13 @@ class Session:
 
         `state` is the current state, `(state_dim,)`. `executed` says what was executed since the last act; empty means the
         whole last chunk. `reward` is short for it when only rewards are to be told: one for each step executed since.
+        `nothing_executed` plans anew in the place of the last act: none of its actions was executed, and no time has passed.
         """
         if reward is not None:
             if executed:
                 raise ValueError("rewards stand in `executed` when it is given")
             executed = [Executed(reward=float(value)) for value in np.atleast_1d(np.asarray(reward, dtype=float))]
-        call = self.next_call(Observation(state, executed), deadline_ms, planned_states)
+        call = self.next_call(Observation(state, executed, nothing_executed), deadline_ms, planned_states)
         chunk = self._client._act(call)
         self.commit(chunk)
         return chunk
@@ -226,6 +228,7 @@ class Session:
             step=self._committed_step + 1,
             state=finite(observation.state, "observation.state"),
             executed=executed_values(observation.executed),
+            nothing_executed=observation.nothing_executed,
             deadline_ms=deadline_ms,
             want_planned_states=planned_states,
         )

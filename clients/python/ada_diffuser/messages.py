@@ -99,8 +99,11 @@ class Observation:
 
     #: The current state, `(state_dim,)`.
     state: ArrayLike
-    #: What was executed since, oldest first. Empty: the whole last chunk, and nothing else is known.
+    #: What was executed since, oldest first. Empty: the whole last chunk, and nothing else is known. More steps than it held
+    #: (after a break, or before the first act) need their actions.
     executed: Sequence[Executed] = ()
+    #: Nothing of the last chunk was executed and no time has passed: this act takes its place. Excludes `executed`.
+    nothing_executed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +123,7 @@ class ActCall:
     step: int
     state: Floats
     executed: tuple[ExecutedValues, ...]
+    nothing_executed: bool = False
     deadline_ms: int | None = None
     want_planned_states: bool = False
 

@@ -1,6 +1,6 @@
 //! What one episode remembers between acts.
 
-use super::{Agent, AgentError, Executed, Observation, SamplerOptions};
+use super::{Agent, AgentError, Executed, Observation, SamplerOptions, finite};
 use crate::model::trajectory::Token;
 use std::collections::VecDeque;
 
@@ -100,6 +100,15 @@ impl Agent {
     /// What was executed since the last act as tokens, normalized; see [`Observation::executed`] for what may be missing.
     pub(super) fn executed_tokens(&self, episode: &Episode, observation: &Observation) -> Result<Vec<Token>, AgentError> {
         let planned = episode.planned.as_ref();
+        if observation.nothing_executed {
+            return match observation.executed.len() {
+                0 => Ok(Vec::new()),
+                steps => Err(AgentError::InvalidObservation {
+                    field: "nothing_executed".into(),
+                    reason: format!("is set, but `executed` holds {steps} step(s): leave one of the two out"),
+                }),
+            };
+        }
         if observation.executed.is_empty() {
             let count = planned.map_or(0, |planned| planned.actions.len());
             return (0..count).map(|j| self.executed_token(planned, j, &Executed::default())).collect();
@@ -128,7 +137,7 @@ impl Agent {
             (None, None) => missing("action", trained.action, "and no action was returned for this step")?,
         };
         let reward = match step.reward {
-            Some(reward) => Some(normalizer.reward.normalize(&self.checked(&field("reward"), &[reward], 1)?)[0]),
+            Some(reward) => Some(normalizer.reward.normalize(&[finite(&field("reward"), reward)?])[0]),
             None => (!trained.reward).then_some(0.0),
         };
         Ok(Token { state, action, reward, noise: 0.0 })

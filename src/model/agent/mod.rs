@@ -169,9 +169,11 @@ impl Agent {
         if values.len() != len {
             return invalid(field.into(), format!("has {} values, the model takes {len}", values.len()));
         }
-        match values.iter().position(|value| !value.is_finite()) {
-            Some(index) => invalid(format!("{field}[{index}]"), format!("{} is not finite", values[index])),
-            None => Ok(values.to_vec()),
-        }
+        values.iter().enumerate().map(|(index, value)| finite(&format!("{field}[{index}]"), *value)).collect()
     }
+}
+
+fn finite(field: &str, value: f32) -> Result<f32, AgentError> {
+    let invalid = || AgentError::InvalidObservation { field: field.into(), reason: format!("{value} is not finite") };
+    if value.is_finite() { Ok(value) } else { Err(invalid()) }
 }

@@ -6,6 +6,7 @@ use crate::model::{
     trajectory::Layout,
 };
 
+mod executed;
 mod trained;
 
 const HORIZON: usize = 8;
@@ -30,7 +31,7 @@ fn unet() -> DenoiserConfig {
 }
 
 fn observation(stream: &mut Philox) -> Observation {
-    Observation { state: (0..3).map(|_| stream.normal()).collect(), executed: Vec::new() }
+    Observation { state: (0..3).map(|_| stream.normal()).collect(), ..Observation::default() }
 }
 
 /// Runs `acts` acts of one episode.
@@ -123,7 +124,7 @@ fn a_warm_act_continues_the_ladder() {
     assert_eq!(first.actions[0], two.actions[0]);
     // The state at position 0 is the imagined one at rung 1; hand the same numbers in as if they had been observed.
     let raw = agent.config.normalizer.state.denormalize(&episode.window.as_ref().unwrap().x[..3]);
-    let (_, second) = agent.act(&episode, &Observation { state: raw, executed: Vec::new() }).unwrap();
+    let (_, second) = agent.act(&episode, &Observation { state: raw, ..Observation::default() }).unwrap();
     let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-4);
     assert!(close(&second.actions[0], &two.actions[1]), "{:?} {:?}", second.actions[0], two.actions[1]);
 }
@@ -156,7 +157,7 @@ fn history_reaches_the_latent_and_missing_parts_are_allowed() {
     let agent = agent(true, 1, unet());
     let mut stream = Philox::new(1);
     let (episode, _) = agent.act(&agent.open(1, &options()).unwrap(), &observation(&mut stream)).unwrap();
-    let seen = |executed| Observation { state: vec![0.1, 0.2, 0.3], executed };
+    let seen = |executed| Observation { state: vec![0.1, 0.2, 0.3], executed, ..Observation::default() };
     let latent = |executed| agent.act(&episode, &seen(executed)).unwrap().1.latent_mean;
     let bare = latent(vec![]);
     let rewarded = latent(vec![Executed { reward: Some(2.0), ..Executed::default() }]);
@@ -169,7 +170,7 @@ fn bad_observations_name_the_field() {
     let mut agent = agent(true, 1, unet());
     agent.config.missing_trained.action = false;
     let episode = agent.open(1, &options()).unwrap();
-    let field = |state: Vec<f32>, executed| match agent.begin(&episode, &Observation { state, executed }) {
+    let field = |state: Vec<f32>, executed| match agent.begin(&episode, &Observation { state, executed, ..Observation::default() }) {
         Err(AgentError::InvalidObservation { field, .. }) => field,
         other => panic!("{other:?}"),
     };
@@ -178,7 +179,7 @@ fn bad_observations_name_the_field() {
     assert_eq!(field(vec![0.0, f32::NAN, 0.0], vec![]), "state[1]");
     assert_eq!(field(vec![0.0; 3], executed(None, None)), "executed[0].action");
     assert_eq!(field(vec![0.0; 3], executed(Some(vec![0.0]), None)), "executed[0].action");
-    assert_eq!(field(vec![0.0; 3], executed(Some(vec![0.0; 2]), Some(f32::INFINITY))), "executed[0].reward[0]");
+    assert_eq!(field(vec![0.0; 3], executed(Some(vec![0.0; 2]), Some(f32::INFINITY))), "executed[0].reward");
 }
 
 #[test]
@@ -208,7 +209,7 @@ fn one_position_is_the_plain_sampler() {
     for eta in [0.0, 1.0] {
         let options = SamplerOptions { sub_steps: 10, eta, ..options() };
         let state = [0.4, -0.1, 0.2];
-        let observation = Observation { state: state.to_vec(), executed: Vec::new() };
+        let observation = Observation { state: state.to_vec(), ..Observation::default() };
         let (_, chunk) = agent.act(&agent.open(3, &options).unwrap(), &observation).unwrap();
         let expected = plain_sampler(&agent, &agent.config.normalizer.state.normalize(&state), &options);
         assert_eq!(chunk.evaluations, 10);

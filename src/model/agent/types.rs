@@ -72,8 +72,11 @@ pub struct Spec {
 pub struct Observation {
     /// The current state s_tau.
     pub state: Vec<f32>,
-    /// What was executed since the last act, oldest first; empty means: the chunk returned last was executed, nothing else is known.
+    /// What was executed since the last act, oldest first; empty means: the chunk returned last was executed, nothing else is known. More
+    /// steps than were returned, or steps before the first act, tell of a past that the agent had no part in.
     pub executed: Vec<Executed>,
+    /// None of the last chunk was executed, and no time has passed: this act is in its place. Excludes `executed`.
+    pub nothing_executed: bool,
 }
 
 /// One executed step; what is missing is masked.

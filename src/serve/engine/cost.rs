@@ -100,7 +100,7 @@ fn timed(work: impl FnOnce() -> Result<(), AgentError>) -> Result<Duration, Agen
 
 /// First acts of as many sessions, in the middle of what the model knows.
 fn descents(agent: &Agent, len: usize) -> Result<Vec<Descent>, AgentError> {
-    let observation = Observation { state: agent.config().normalizer.state.mean.clone(), executed: Vec::new() };
+    let observation = Observation { state: agent.config().normalizer.state.mean.clone(), ..Observation::default() };
     let begin = |seed| agent.begin(&agent.open(seed, &agent.spec().sampler)?, &observation);
     (0..len as u64).map(begin).collect()
 }

@@ -55,14 +55,14 @@ pub fn act_request(request: pb::ActRequest, patience: Option<Duration>) -> Resul
 }
 
 fn observation(observation: pb::Observation) -> Observation {
-    let pb::Observation { state, executed } = observation;
+    let pb::Observation { state, executed, nothing_executed } = observation;
     let vector = |pb::Vector { values }| values;
     let executed = executed.into_iter().map(|pb::Executed { state, action, reward }| Executed {
         state: state.map(vector),
         action: action.map(vector),
         reward,
     });
-    Observation { state, executed: executed.collect() }
+    Observation { state, executed: executed.collect(), nothing_executed }
 }
 
 pub fn list_request(request: pb::ListSessionsRequest) -> ListRequest {

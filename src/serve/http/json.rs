@@ -92,8 +92,11 @@ pub struct ActBody {
 struct ObservationBody {
     /// The current state.
     state: Vec<f32>,
-    /// What was executed since the last act, oldest first; absent or empty: the last chunk.
+    /// What was executed since the last act, oldest first; absent or empty: the last chunk. More steps than were returned are allowed, with
+    /// their actions.
     executed: Option<Vec<ExecutedBody>>,
+    /// Nothing of the last chunk was executed, and no time has passed; then `executed` must be absent or empty.
+    nothing_executed: Option<bool>,
 }
 
 /// One executed step; what is missing is masked.
@@ -152,12 +155,16 @@ impl ActBody {
     /// The act of this session.
     pub fn into_request(self, session_id: String) -> ActRequest {
         let Self { session_id: _, step, observation, deadline_ms, want_planned_states } = self;
-        let ObservationBody { state, executed } = observation;
+        let ObservationBody { state, executed, nothing_executed } = observation;
         let step_of = |ExecutedBody { state, action, reward }| Executed { state, action, reward };
         ActRequest {
             session_id,
             step,
-            observation: Observation { state, executed: executed.unwrap_or_default().into_iter().map(step_of).collect() },
+            observation: Observation {
+                state,
+                executed: executed.unwrap_or_default().into_iter().map(step_of).collect(),
+                nothing_executed: nothing_executed.unwrap_or(false),
+            },
             deadline: deadline_ms.map(|ms| Duration::from_millis(ms.into())),
             want_planned_states: want_planned_states.unwrap_or(false),
             face: Face::Http,

@@ -317,8 +317,9 @@ impl Slot {
 
 /// Key of an observation: every value by its bits, every absence by a mark, every list by its length.
 pub fn key_of(observation: &Observation) -> Key {
-    let Observation { state, executed } = observation;
+    let Observation { state, executed, nothing_executed } = observation;
     let mut hash = Sha256::new();
+    hash.update([u8::from(*nothing_executed)]);
     let mut put = |values: Option<&[f32]>| {
         hash.update(values.map_or(u64::MAX, |values| values.len() as u64).to_le_bytes());
         for value in values.into_iter().flatten() {
@@ -346,17 +347,19 @@ mod tests {
             action: action.map(<[f32]>::to_vec),
             reward,
         };
+        let told = |executed| Observation { state: vec![1.0], executed, ..Observation::default() };
         let observations = [
-            Observation { state: vec![1.0, 2.0], executed: vec![] },
-            Observation { state: vec![1.0], executed: vec![] },
-            Observation { state: vec![1.0], executed: vec![step(Some(&[2.0]), None, None)] },
-            Observation { state: vec![1.0], executed: vec![step(None, Some(&[2.0]), None)] },
-            Observation { state: vec![1.0], executed: vec![step(None, None, Some(2.0))] },
-            Observation { state: vec![1.0], executed: vec![step(None, None, None)] },
-            Observation { state: vec![1.0], executed: vec![step(Some(&[]), None, None)] },
-            Observation { state: vec![1.0], executed: vec![step(None, None, None), step(None, None, None)] },
-            Observation { state: vec![0.0], executed: vec![] },
-            Observation { state: vec![-0.0], executed: vec![] },
+            Observation { state: vec![1.0, 2.0], ..Observation::default() },
+            Observation { state: vec![1.0], ..Observation::default() },
+            Observation { state: vec![1.0], nothing_executed: true, ..Observation::default() },
+            told(vec![step(Some(&[2.0]), None, None)]),
+            told(vec![step(None, Some(&[2.0]), None)]),
+            told(vec![step(None, None, Some(2.0))]),
+            told(vec![step(None, None, None)]),
+            told(vec![step(Some(&[]), None, None)]),
+            told(vec![step(None, None, None), step(None, None, None)]),
+            Observation { state: vec![0.0], ..Observation::default() },
+            Observation { state: vec![-0.0], ..Observation::default() },
         ];
         for (i, a) in observations.iter().enumerate() {
             assert_eq!(key_of(a), key_of(&a.clone()));

@@ -5,7 +5,8 @@ use super::*;
 const SEEDS: usize = 64;
 const STEPS: u64 = 4;
 
-/// What was seen and done at a step, different for every seed and step; every kind of missing part occurs.
+/// What was seen and done at a step, different for every seed and step; every kind of missing part occurs, and so do acts in the place of
+/// the one before.
 fn observation(seed: usize, step: u64) -> pb::Observation {
     let wave = |i: usize| ((seed * 31 + step as usize * 7 + i * 3) as f32 * 0.37).sin();
     let vector = |from: usize, len: usize| pb::Vector { values: (from..from + len).map(wave).collect() };
@@ -15,7 +16,8 @@ fn observation(seed: usize, step: u64) -> pb::Observation {
         reward: seed.is_multiple_of(3).then(|| wave(20)),
     };
     let executed = if step > 1 && !seed.is_multiple_of(5) { vec![executed] } else { vec![] };
-    pb::Observation { state: vector(0, 4).values, executed }
+    let nothing_executed = executed.is_empty() && seed.is_multiple_of(10);
+    pb::Observation { state: vector(0, 4).values, executed, nothing_executed }
 }
 
 fn request(id: &str, seed: usize, step: u64) -> pb::ActRequest {
@@ -24,12 +26,13 @@ fn request(id: &str, seed: usize, step: u64) -> pb::ActRequest {
 }
 
 fn request_json(id: &str, seed: usize, step: u64) -> Value {
-    let pb::Observation { state, executed } = observation(seed, step);
+    let pb::Observation { state, executed, nothing_executed } = observation(seed, step);
     let executed: Vec<_> = executed
         .into_iter()
         .map(|pb::Executed { state, action, reward }| json!({"state": state.map(|v| v.values), "action": action.map(|v| v.values), "reward": reward}))
         .collect();
-    json!({"session_id": id, "step": step, "observation": {"state": state, "executed": executed}, "want_planned_states": true})
+    let observation = json!({"state": state, "executed": executed, "nothing_executed": nothing_executed});
+    json!({"session_id": id, "step": step, "observation": observation, "want_planned_states": true})
 }
 
 /// Everything numeric in an answer, by its bits.

@@ -62,7 +62,7 @@ fn narrow(dir: &Path) -> Agent {
 /// An act of `asked` that is run on `run_on`.
 fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Receiver<Outcome>) {
     let episode = Arc::new(asked.open(seed, &asked.spec().sampler).unwrap());
-    let observation = Observation { state: vec![0.1; asked.spec().layout.state_dim], executed: vec![] };
+    let observation = Observation { state: vec![0.1; asked.spec().layout.state_dim], ..Observation::default() };
     let question = Question { episode, observation };
     let descent = question.begin(asked).unwrap();
     let (outcome, receiver) = mpsc::channel();

@@ -108,7 +108,7 @@ async fn observations_that_do_not_fit() {
         assert_eq!(trailer(&grpc, "ada-field").as_deref(), Some("observation.state[1]"));
     }
     let with = |executed: pb::Executed| {
-        let observation = pb::Observation { state: STATE.to_vec(), executed: vec![executed] };
+        let observation = pb::Observation { state: STATE.to_vec(), executed: vec![executed], ..Default::default() };
         pb::ActRequest { observation: Some(observation), ..act(&id, 1, &STATE) }
     };
     let vector = |values: &[f32]| Some(pb::Vector { values: values.to_vec() });

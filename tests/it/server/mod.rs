@@ -248,7 +248,7 @@ impl Running {
 
 /// An act over gRPC.
 pub fn act(id: &str, step: u64, state: &[f32]) -> pb::ActRequest {
-    let observation = pb::Observation { state: state.to_vec(), executed: vec![] };
+    let observation = pb::Observation { state: state.to_vec(), ..Default::default() };
     pb::ActRequest { session_id: id.to_owned(), step, observation: Some(observation), ..Default::default() }
 }
 

@@ -129,6 +129,7 @@ def _act_request(call: ActCall) -> agent_pb2.ActRequest:
     if call.deadline_ms is not None:
         request.deadline_ms = call.deadline_ms
     request.observation.state.extend(call.state.tolist())
+    request.observation.nothing_executed = call.nothing_executed
     for step in call.executed:
         out = request.observation.executed.add()
         if step.state is not None:

@@ -168,7 +168,7 @@ def _act_body(call: ActCall) -> dict[str, Any]:
     ]
     return _without_none(
         step=call.step,
-        observation={"state": call.state.tolist(), "executed": executed},
+        observation=_without_none(state=call.state.tolist(), executed=executed, nothing_executed=call.nothing_executed or None),
         deadline_ms=call.deadline_ms,
         want_planned_states=call.want_planned_states or None,
     )

@@ -114,7 +114,10 @@ def _act(client: Client, due: list[_Lane], acts: ActLog, *, batched: bool) -> No
     if batched:
         answers = client.act_batch(asked)
     else:
-        answers = [session.act(observation.state, observation.executed) for session, observation in asked]
+        answers = [
+            session.act(observation.state, observation.executed, nothing_executed=observation.nothing_executed)
+            for session, observation in asked
+        ]
     elapsed_s = time.perf_counter() - started
     chunks = []
     for lane, answer in zip(due, answers, strict=True):

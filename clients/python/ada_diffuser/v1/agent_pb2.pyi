@@ -54,12 +54,14 @@ class ActRequest(_message.Message):
     def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., observation: _Optional[_Union[Observation, _Mapping]] = ..., deadline_ms: _Optional[int] = ..., want_planned_states: bool = ...) -> None: ...
 
 class Observation(_message.Message):
-    __slots__ = ("state", "executed")
+    __slots__ = ("state", "executed", "nothing_executed")
     STATE_FIELD_NUMBER: _ClassVar[int]
     EXECUTED_FIELD_NUMBER: _ClassVar[int]
+    NOTHING_EXECUTED_FIELD_NUMBER: _ClassVar[int]
     state: _containers.RepeatedScalarFieldContainer[float]
     executed: _containers.RepeatedCompositeFieldContainer[Executed]
-    def __init__(self, state: _Optional[_Iterable[float]] = ..., executed: _Optional[_Iterable[_Union[Executed, _Mapping]]] = ...) -> None: ...
+    nothing_executed: bool
+    def __init__(self, state: _Optional[_Iterable[float]] = ..., executed: _Optional[_Iterable[_Union[Executed, _Mapping]]] = ..., nothing_executed: bool = ...) -> None: ...
 
 class Executed(_message.Message):
     __slots__ = ("state", "action", "reward")
