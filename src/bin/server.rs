@@ -2,11 +2,15 @@
 
 use ada_diffuser::{
     restart,
-    serve::{Server, config::Config, telemetry},
+    serve::{
+        Server,
+        config::{Config, ConfigError},
+        telemetry,
+    },
 };
 use anyhow::Context;
 use clap::Parser;
-use std::{net::SocketAddr, path::PathBuf};
+use std::path::PathBuf;
 use tokio::signal::unix::{SignalKind, signal};
 
 /// Serves Ada-Diffuser models over gRPC and REST on one port.
@@ -16,16 +20,16 @@ struct Flags {
     /// Settings as TOML; deploy/server.toml lists them all.
     #[arg(long, env = "ADA_CONFIG", value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Address of both faces (server.listen).
-    #[arg(long)]
-    listen: Option<SocketAddr>,
+    /// Address of both faces, e.g. 127.0.0.1:7777 or localhost:7777 (server.listen).
+    #[arg(long, value_name = "HOST:PORT")]
+    listen: Option<String>,
     /// Directory of the checkpoints (models.dir).
     #[arg(long, value_name = "DIR")]
     models: Option<PathBuf>,
     /// Model of a client that names none (models.default).
     #[arg(long, value_name = "NAME")]
     default_model: Option<String>,
-    /// Any setting, e.g. engine.workers=2; may be repeated.
+    /// Any setting, e.g. engine.workers=2; may be repeated. Before it count the environment (ADA__ENGINE__WORKERS=2) and the file.
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE", value_parser = key_value)]
     settings: Vec<(String, String)>,
 }
@@ -36,16 +40,15 @@ fn key_value(text: &str) -> Result<(String, String), String> {
 }
 
 impl Flags {
-    /// Flags as settings, the named ones last.
-    fn settings(self) -> (Option<PathBuf>, Vec<(String, String)>) {
+    /// All settings, the named flags last.
+    fn config(self) -> Result<Config, ConfigError> {
         let Self { config, listen, models, default_model, mut settings } = self;
-        let named = [
-            ("server.listen", listen.map(|address| address.to_string())),
-            ("models.dir", models.map(|dir| dir.to_string_lossy().into_owned())),
-            ("models.default", default_model),
-        ];
+        let named = [("server.listen", listen), ("models.default", default_model)];
         settings.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
-        (config, settings)
+        let mut config = Config::load(config.as_deref(), &settings)?;
+        // A path need not be text.
+        config.models.dir = models.unwrap_or(config.models.dir);
+        Ok(config)
     }
 }
 
@@ -54,8 +57,7 @@ fn main() -> anyhow::Result<()> {
     if let Err(error) = restart::with_environment(&restart::ONE_THREAD_EACH) {
         eprintln!("warning: could not start anew with one thread for each product ({error}); serving will be slower");
     }
-    let (file, settings) = flags.settings();
-    let config = Config::load(file.as_deref(), &settings)?;
+    let config = flags.config()?;
     telemetry::install_log(&config.telemetry);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(config.server.io_threads).enable_all().build()?;
     let served = runtime.block_on(async {

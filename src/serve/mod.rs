@@ -22,7 +22,7 @@ use registry::{Registry, RegistryError};
 use service::Service;
 use std::{future::Future, io, net::SocketAddr, sync::Arc, time::Duration};
 use tokio::{
-    net::TcpListener,
+    net::{TcpListener, lookup_host},
     time::{interval, sleep},
 };
 use tokio_util::sync::CancellationToken;
@@ -33,11 +33,11 @@ const ENGINE_PATIENCE: Duration = Duration::from_secs(2);
 /// Why the server did not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// The address is taken or not ours.
+    /// The address is taken or not ours, or nobody knows the name.
     #[error("server.listen {address}: {source}")]
     Listen {
         /// The setting.
-        address: SocketAddr,
+        address: String,
         /// What the system said.
         source: io::Error,
     },
@@ -64,9 +64,10 @@ impl Server {
     /// # Errors
     /// If the address cannot be bound.
     pub async fn bind(config: Config) -> Result<Self, ServerError> {
-        let address = config.server.listen;
-        let listener = TcpListener::bind(address).await.map_err(|source| ServerError::Listen { address, source })?;
-        Ok(Self { listener, config })
+        match listen(&config.server.listen).await {
+            Ok(listener) => Ok(Self { listener, config }),
+            Err(source) => Err(ServerError::Listen { address: config.server.listen, source }),
+        }
     }
 
     /// The address it is bound to.
@@ -118,6 +119,13 @@ impl Server {
         tracing::info!("ended");
         served
     }
+}
+
+/// Of the addresses of a name the first that can be had. Examples and clients say 127.0.0.1, so of `localhost` it must not be ::1 alone.
+async fn listen(address: &str) -> io::Result<TcpListener> {
+    let mut addresses: Vec<_> = lookup_host(address).await?.collect();
+    addresses.sort_by_key(SocketAddr::is_ipv6);
+    TcpListener::bind(&addresses[..]).await
 }
 
 async fn load(service: &Arc<Service>, config: Config) -> Result<(), ServerError> {

@@ -160,3 +160,18 @@ fn the_binary_names_what_is_wrong() {
     let models = models_dir().to_str().unwrap();
     assert!(run(&["--listen", "127.0.0.1:0", "--models", models, "--default-model", "x"], &[]).contains("models.default"));
 }
+
+/// `--listen localhost:7777` was "invalid socket address syntax". Of the name's addresses it is the one that examples and clients use.
+#[tokio::test(flavor = "multi_thread")]
+async fn it_listens_on_a_name() {
+    let server = start(|config| config.server.listen = "localhost:0".to_owned()).await;
+    assert!(server.address.ip().is_loopback() && server.address.is_ipv4(), "{}", server.address);
+    let mut config = config();
+    config.server.listen = "nobody.invalid:7777".to_owned();
+    let error = Server::bind(config.validated().unwrap()).await.map(|_| ()).unwrap_err().to_string();
+    assert!(error.starts_with("server.listen nobody.invalid:7777: "), "{error}");
+    let flags = ["--listen", "localhost:0", "--set", "engine.anytime=no"];
+    let output = Command::new(env!("CARGO_BIN_EXE_ada-server")).args(flags).output().unwrap();
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(text.contains("engine.anytime") && !text.contains("listen"), "{text}");
+}

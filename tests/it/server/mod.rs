@@ -97,7 +97,7 @@ impl Drop for Running {
 /// The test settings: all models, `tiny` by default, two workers.
 pub fn config() -> Config {
     let mut config = Config::default();
-    config.server.listen = "127.0.0.1:0".parse().unwrap();
+    config.server.listen = "127.0.0.1:0".to_owned();
     config.server.drain_notice_ms = 0;
     config.engine.workers = 2;
     config.models.dir = PathBuf::from(models_dir());

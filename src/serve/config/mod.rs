@@ -1,9 +1,15 @@
 //! Every setting of the server, read once: file, then environment (`ADA__SECTION__KEY`), then flags; `deploy/server.toml` lists them all.
 
+mod layers;
+#[cfg(test)]
+mod tests;
+
+pub use layers::Origin;
+
 use crate::model::nn::Precision;
-use config::{Environment, File, FileFormat};
+use layers::Layers;
 use serde::{Deserialize, Serialize};
-use std::{net::SocketAddr, path::Path, path::PathBuf, thread};
+use std::{env, ffi::OsString, io, net::Ipv6Addr, path::Path, path::PathBuf, thread};
 
 /// All settings; each section documents its own.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -29,8 +35,8 @@ pub struct Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServerConfig {
-    /// Address of both faces.
-    pub listen: SocketAddr,
+    /// `HOST:PORT` of both faces. A name is looked up once, at the start; of its addresses the first that can be had is taken, IPv4 first.
+    pub listen: String,
     /// Threads of the I/O runtime; 0: one per core.
     pub io_threads: usize,
     /// Open connections; one more is answered 503 and closed.
@@ -77,7 +83,7 @@ pub struct LimitsConfig {
     pub act_batch_len_max: usize,
     /// Acts of one ActStream or WebSocket that are worked on at once; the next is read when one is answered.
     pub stream_acts_max: usize,
-    /// Time for an act whose client named none.
+    /// Time for an act without `deadline_ms`. The call's own timeout, of either face, only ends it earlier.
     pub act_deadline_ms: u64,
     /// The longest time a client may ask for; more is cut to this.
     pub act_deadline_ms_max: u64,
@@ -115,7 +121,7 @@ pub struct EngineConfig {
     pub queue_len_max: usize,
     /// Acts that share one network evaluation of a worker.
     pub batch_len_max: usize,
-    /// Whether an act whose client named a deadline takes larger jumps, or gives out the current window, when it would come too late
+    /// Whether an act with `deadline_ms` takes larger jumps, or gives out the current window, when it would come too late
     /// otherwise; its answer is marked `degraded`.
     pub anytime: bool,
     /// Time kept for commit and answer of such an act.
@@ -160,13 +166,7 @@ pub enum LogFormat {
 
 impl Default for ServerConfig {
     fn default() -> Self {
-        Self {
-            listen: SocketAddr::from(([127, 0, 0, 1], 7777)),
-            io_threads: 0,
-            connections_max: 4096,
-            drain_notice_ms: 250,
-            drain_timeout_ms: 10_000,
-        }
+        Self { listen: "127.0.0.1:7777".to_owned(), io_threads: 0, connections_max: 4096, drain_notice_ms: 250, drain_timeout_ms: 10_000 }
     }
 }
 
@@ -243,9 +243,42 @@ impl Default for TelemetryConfig {
 /// Why the settings were refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// Not readable, not TOML, an unknown key or a value of the wrong type.
-    #[error(transparent)]
-    Read(#[from] config::ConfigError),
+    /// The file cannot be read.
+    #[error("{path}: {source}")]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The file is not TOML.
+    #[error("{path}: {source}")]
+    Toml {
+        /// The file.
+        path: PathBuf,
+        /// Where and why.
+        source: Box<toml::de::Error>,
+    },
+    /// There is no such key.
+    #[error("{key}: no such setting; {known} ({origin})")]
+    Unknown {
+        /// What was said.
+        key: String,
+        /// What there is.
+        known: String,
+        /// Who said it.
+        origin: Origin,
+    },
+    /// A value of the wrong type.
+    #[error("{key}: {reason} ({origin})")]
+    Value {
+        /// `section.key`.
+        key: String,
+        /// What is wrong.
+        reason: String,
+        /// Who said it.
+        origin: Origin,
+    },
     /// A value outside its range.
     #[error("{key}: {reason}")]
     Invalid {
@@ -262,16 +295,21 @@ impl Config {
     /// # Errors
     /// If the file cannot be read, or a key is unknown, or a value is of the wrong type or out of range.
     pub fn load(file: Option<&Path>, flags: &[(String, String)]) -> Result<Self, ConfigError> {
-        let environment = Environment::with_prefix("ADA").prefix_separator("__").separator("__").try_parsing(true);
-        let mut builder = config::Config::builder();
+        Self::read(file, env::vars_os(), flags)?.validated()
+    }
+
+    fn read(
+        file: Option<&Path>,
+        environment: impl Iterator<Item = (OsString, OsString)>,
+        flags: &[(String, String)],
+    ) -> Result<Self, ConfigError> {
+        let mut layers = Layers::new();
         if let Some(path) = file {
-            builder = builder.add_source(File::from(path).format(FileFormat::Toml));
+            layers.file(path)?;
         }
-        builder = builder.add_source(environment);
-        for (key, value) in flags {
-            builder = builder.set_override(key, value.as_str())?;
-        }
-        builder.build()?.try_deserialize::<Self>()?.validated()
+        layers.environment(environment)?;
+        layers.flags(flags)?;
+        Ok(layers.into_config())
     }
 
     /// The same with 0 for "one per core" resolved.
@@ -289,6 +327,7 @@ impl Config {
             }
         }
         let range = |key, holds: bool, reason| if holds { Ok(()) } else { Err(ConfigError::Invalid { key, reason }) };
+        range("server.listen", is_host_and_port(&self.server.listen), "must be HOST:PORT, e.g. 127.0.0.1:7777 or localhost:7777")?;
         range("connection.header_bytes_max", self.connection.header_bytes_max >= 8192, "must be at least 8192")?;
         range("sessions.ttl_ms", self.sessions.ttl_ms <= self.sessions.ttl_ms_max, "must be at most sessions.ttl_ms_max")?;
         range("limits.json_depth_max", self.limits.json_depth_max <= 128, "must be at most 128")?;
@@ -329,38 +368,13 @@ impl Config {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn load(text: &str, flags: &[(&str, &str)]) -> Result<Config, ConfigError> {
-        let file = tempfile::NamedTempFile::with_suffix(".toml").unwrap();
-        std::fs::write(file.path(), text).unwrap();
-        let flags: Vec<_> = flags.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
-        Config::load(Some(file.path()), &flags)
-    }
-
-    /// `deploy/server.toml` holds every key with its default, and nothing else.
-    #[test]
-    fn deploy_file_lists_every_default() {
-        let listed: toml::Value = toml::from_str(include_str!("../../deploy/server.toml")).unwrap();
-        assert_eq!(listed, toml::Value::try_from(Config::default()).unwrap());
-    }
-
-    #[test]
-    fn flags_beat_the_file() {
-        let text = "[engine]\nworkers = 3\nbatch_len_max = 5\n[server]\nlisten = \"127.0.0.1:1\"\n";
-        let config = load(text, &[("engine.workers", "4"), ("server.listen", "127.0.0.1:2")]).unwrap();
-        assert_eq!((config.engine.workers, config.engine.batch_len_max, config.server.listen.port()), (4, 5, 2));
-    }
-
-    #[test]
-    fn what_is_wrong_is_named() {
-        let message = |text, flags: &[(&str, &str)]| load(text, flags).unwrap_err().to_string();
-        assert!(message("[engine]\nworker = 3\n", &[]).contains("worker"));
-        assert!(message("", &[("engine.nothing", "1")]).contains("nothing"));
-        assert!(message("[engine]\nworkers = \"many\"\n", &[]).contains("many"));
-        assert_eq!(message("[engine]\nqueue_len_max = 0\n", &[]), "engine.queue_len_max: must be at least 1");
-        assert_eq!(message("[sessions]\nttl_ms = 90000000\n", &[]), "sessions.ttl_ms: must be at most sessions.ttl_ms_max");
-    }
+/// Whether it is `HOST:PORT`, the host a name or an address (IPv6 in brackets).
+fn is_host_and_port(text: &str) -> bool {
+    let Some((host, port)) = text.rsplit_once(':') else { return false };
+    let bracketed = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
+    let is_host = match bracketed {
+        Some(address) => address.parse::<Ipv6Addr>().is_ok(),
+        None => !host.is_empty() && !host.contains(|c: char| c.is_whitespace() || ":[]/@".contains(c)),
+    };
+    is_host && port.parse::<u16>().is_ok()
 }
