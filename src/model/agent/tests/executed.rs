@@ -91,3 +91,18 @@ fn nothing_executed_excludes_what_was_executed() {
         other => panic!("{other:?}"),
     }
 }
+
+/// The past of an episode that began elsewhere may be told at once: what matters is what happened, not how many acts told it.
+#[test]
+fn a_primed_session_goes_on_as_the_one_that_lived_it() {
+    let agent = agent(true, 3, unet());
+    let open = || agent.open(5, &SamplerOptions { streaming: false, eta: 0.7, ..options() }).unwrap();
+    let state = |t: usize| [0.1 * t as f32, 0.2, -0.1 * t as f32];
+    let action = |t: usize| [0.3 - 0.1 * t as f32, 0.5];
+    let mut lived = agent.act(&open(), &seen(state(0), vec![])).unwrap();
+    for t in 1..6 {
+        lived = agent.act(&lived.0, &seen(state(t), vec![step(None, action(t - 1))])).unwrap();
+    }
+    let told = (0..5).map(|t| step(Some(state(t)), action(t))).collect();
+    assert_eq!(agent.act(&open(), &seen(state(5), told)).unwrap(), lived);
+}
