@@ -9,9 +9,7 @@ pub enum ServiceError {
     /// The request is wrong and stays wrong: correct `field`.
     #[error("{field}: {reason}")]
     Invalid {
-        /// What kind of thing is wrong.
-        part: Part,
-        /// Path of the field, e.g. `observation.executed[2].action`.
+        /// Path of the field, e.g. `observation.executed[2].action`; its beginning says what kind of thing is wrong.
         field: String,
         /// What is wrong and what is expected.
         reason: String,
@@ -39,7 +37,7 @@ pub enum ServiceError {
         committed: u64,
     },
     /// Open a session.
-    #[error("no such session")]
+    #[error("no such session: it was closed, or is of a server that ended since (a restart ends all sessions)")]
     SessionNotFound,
     /// Open a session: this one was idle for too long.
     #[error("the session has expired")]
@@ -48,10 +46,12 @@ pub enum ServiceError {
     #[error("the session was evicted while idle to make room")]
     SessionEvicted,
     /// See the list of models.
-    #[error("no model {model:?}")]
+    #[error("no model {model:?}; {instead}")]
     ModelNotFound {
         /// What was asked for.
         model: String,
+        /// What there is.
+        instead: String,
     },
     /// Send less.
     #[error("{what} exceeds {limit}")]
@@ -111,17 +111,6 @@ pub enum ServiceError {
     },
 }
 
-/// What kind of thing is wrong with an invalid request.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
-    /// The message of an act.
-    Observation,
-    /// Sampler options.
-    Options,
-    /// Any other request.
-    Request,
-}
-
 /// How far an act had come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
@@ -152,8 +141,8 @@ impl std::fmt::Display for Stage {
 
 impl ServiceError {
     /// An invalid field.
-    pub fn invalid(part: Part, field: impl Into<String>, reason: impl Into<String>) -> Self {
-        Self::Invalid { part, field: field.into(), reason: reason.into() }
+    pub fn invalid(field: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self::Invalid { field: field.into(), reason: reason.into() }
     }
 
     /// Our fault: `cause` goes to the log, only its id to the client.
@@ -166,8 +155,8 @@ impl ServiceError {
     /// What the model said, in the words of the service.
     pub fn from_agent(error: AgentError) -> Self {
         match error {
-            AgentError::InvalidObservation { field, reason } => Self::invalid(Part::Observation, format!("observation.{field}"), reason),
-            AgentError::InvalidOptions { field, reason } => Self::invalid(Part::Options, format!("options.{field}"), reason),
+            AgentError::InvalidObservation { field, reason } => Self::invalid(format!("observation.{field}"), reason),
+            AgentError::InvalidOptions { field, reason } => Self::invalid(format!("options.{field}"), reason),
             AgentError::NonFinite => {
                 let id = Uuid::new_v4();
                 tracing::error!(%id, "the network's output is not finite");
@@ -181,9 +170,7 @@ impl ServiceError {
     /// The fixed word a client acts on.
     pub fn reason(&self) -> &'static str {
         match self {
-            Self::Invalid { part: Part::Observation, .. } => "OBSERVATION_INVALID",
-            Self::Invalid { part: Part::Options, .. } => "OPTIONS_INVALID",
-            Self::Invalid { part: Part::Request, .. } => "REQUEST_INVALID",
+            Self::Invalid { field, .. } => reason_of(field),
             Self::StepOutOfOrder { .. } => "STEP_OUT_OF_ORDER",
             Self::SessionBusy { .. } => "SESSION_BUSY",
             Self::StepPayloadMismatch { .. } => "STEP_PAYLOAD_MISMATCH",
@@ -240,22 +227,34 @@ impl ServiceError {
     }
 }
 
+/// The word for a wrong field: whatever face it came through, only what is of the observation is called so.
+fn reason_of(field: &str) -> &'static str {
+    let of_act = field.strip_prefix("acts[").and_then(|rest| rest.split_once("].")).map_or(field, |(_, of_act)| of_act);
+    match of_act.split(['.', '[']).next() {
+        Some("observation") => "OBSERVATION_INVALID",
+        Some("options") => "OPTIONS_INVALID",
+        _ => "REQUEST_INVALID",
+    }
+}
+
 #[cfg(test)]
 impl ServiceError {
     /// One of each kind with its codes in both tables and its word: (error, gRPC, HTTP, reason).
     pub fn table() -> Vec<(Self, i32, u16, &'static str)> {
         let (id, retry_after_ms, committed, step) = (Uuid::nil(), 1500, 3, 9);
         vec![
-            (Self::invalid(Part::Observation, "observation.state", "short"), 3, 400, "OBSERVATION_INVALID"),
-            (Self::invalid(Part::Options, "options.eta", "2"), 3, 400, "OPTIONS_INVALID"),
-            (Self::invalid(Part::Request, "ttl_ms", "0"), 3, 400, "REQUEST_INVALID"),
+            (Self::invalid("observation.state", "short"), 3, 400, "OBSERVATION_INVALID"),
+            (Self::invalid("options.eta", "2"), 3, 400, "OPTIONS_INVALID"),
+            (Self::invalid("acts[2].observation", "is missing"), 3, 400, "OBSERVATION_INVALID"),
+            (Self::invalid("ttl_ms", "0"), 3, 400, "REQUEST_INVALID"),
+            (Self::invalid("acts[2].step", "-1"), 3, 400, "REQUEST_INVALID"),
             (Self::StepOutOfOrder { step, committed }, 10, 409, "STEP_OUT_OF_ORDER"),
             (Self::SessionBusy { committed }, 10, 409, "SESSION_BUSY"),
             (Self::StepPayloadMismatch { step, committed }, 9, 422, "STEP_PAYLOAD_MISMATCH"),
             (Self::SessionNotFound, 5, 404, "SESSION_NOT_FOUND"),
             (Self::SessionExpired, 5, 410, "SESSION_EXPIRED"),
             (Self::SessionEvicted, 5, 410, "SESSION_EVICTED"),
-            (Self::ModelNotFound { model: "x".into() }, 5, 404, "MODEL_NOT_FOUND"),
+            (Self::ModelNotFound { model: "x".into(), instead: "there are: y".into() }, 5, 404, "MODEL_NOT_FOUND"),
             (Self::TooLarge { what: "bytes", limit: 1 }, 8, 413, "TOO_LARGE"),
             (Self::QueueFull { retry_after_ms }, 8, 429, "QUEUE_FULL"),
             (Self::Quota { retry_after_ms }, 8, 429, "QUOTA"),

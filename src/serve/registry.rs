@@ -9,6 +9,8 @@ use std::{collections::BTreeMap, fs, io, path::Path, path::PathBuf, sync::Arc, t
 /// Digits of a digest that a client must at least name.
 const DIGEST_PREFIX_MIN: usize = 8;
 const NAME_LEN_MAX: usize = 64;
+/// Names that an error lists.
+const NAMES_SHOWN: usize = 20;
 
 /// A loaded model under its name.
 #[derive(Clone)]
@@ -70,8 +72,7 @@ impl Registry {
             return Err(RegistryError::Empty { dir: config.dir.clone() });
         }
         let Some(default) = models.values().find(|model| model.is_default).map(|model| model.name.clone()) else {
-            let loaded = models.keys().map(|name| &**name).collect::<Vec<_>>().join(", ");
-            return Err(RegistryError::NoDefault { name: config.default.clone(), loaded });
+            return Err(RegistryError::NoDefault { name: config.default.clone(), loaded: names(&models) });
         };
         Ok(Self { models, default })
     }
@@ -91,11 +92,23 @@ impl Registry {
             None => (reference, None),
         };
         let name = if name.is_empty() { &*self.default } else { name };
-        let is_meant =
-            |model: &&Model| digest.is_none_or(|digest| digest.len() >= DIGEST_PREFIX_MIN && model.agent.spec().digest.starts_with(digest));
-        let shown = || ServiceError::ModelNotFound { model: reference.chars().take(2 * NAME_LEN_MAX).collect() };
-        self.models.get(name).filter(is_meant).ok_or_else(shown)
+        let not_found = |instead| ServiceError::ModelNotFound { model: reference.chars().take(2 * NAME_LEN_MAX).collect(), instead };
+        let model = self.models.get(name).ok_or_else(|| not_found(format!("there are: {}", names(&self.models))))?;
+        let actual = &model.agent.spec().digest;
+        let is_meant = digest.is_none_or(|digest| digest.len() >= DIGEST_PREFIX_MIN && actual.starts_with(digest));
+        is_meant
+            .then_some(model)
+            .ok_or_else(|| not_found(format!("the digest of {name} is {actual} (name {DIGEST_PREFIX_MIN} digits of it at least)")))
     }
+}
+
+/// Names of the models, for errors.
+fn names(models: &BTreeMap<Arc<str>, Model>) -> String {
+    let mut shown: Vec<_> = models.keys().take(NAMES_SHOWN).map(|name| name.to_string()).collect();
+    if models.len() > shown.len() {
+        shown.push(format!("and {} more", models.len() - shown.len()));
+    }
+    shown.join(", ")
 }
 
 /// Sub-directories that hold a `config.json`, with their names, in order.

@@ -78,8 +78,10 @@ pub struct ActRequest {
     pub step: u64,
     /// What was seen.
     pub observation: Observation,
-    /// Time it may take; None: the configured one.
+    /// Time it may take, in which a coarser answer is better than none; None: the configured one, and no coarser answer.
     pub deadline: Option<Duration>,
+    /// When the caller hangs up, if its protocol says so. It ends the wait as a hang-up does, and changes nothing else.
+    pub timeout: Option<Duration>,
     /// Whether the client wants the planned states with the answer.
     pub want_planned_states: bool,
     /// Which face it came through.

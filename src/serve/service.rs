@@ -5,7 +5,7 @@ use crate::{
     serve::{
         config::{Config, EngineConfig},
         engine::{Engine, EngineOptions, Job, Question, Refusal},
-        error::{Part, ServiceError, Stage},
+        error::{ServiceError, Stage},
         registry::{Model, Registry},
         request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
@@ -212,7 +212,7 @@ impl Service {
     /// `Invalid` if the page token is none of ours.
     pub fn list(&self, request: &ListRequest) -> Result<Page, ServiceError> {
         let token = request.page_token.as_str();
-        let not_ours = |_| ServiceError::invalid(Part::Request, "page_token", "is not a token of a page before");
+        let not_ours = |_| ServiceError::invalid("page_token", "is not a token of a page before");
         let after = if token.is_empty() { None } else { Some(Uuid::try_parse(token).map_err(not_ours)?) };
         let model = (!request.model.is_empty()).then_some(request.model.as_str());
         let len = if request.page_size == 0 { PAGE_LEN } else { request.page_size.min(PAGE_LEN_MAX) };
@@ -244,12 +244,13 @@ impl Service {
     }
 
     async fn act_on(&self, session: &Arc<Session>, request: ActRequest, arrived: Instant) -> Result<Acted, ServiceError> {
-        let ActRequest { step, observation, deadline, want_planned_states, .. } = request;
+        let ActRequest { step, observation, deadline, timeout, want_planned_states, .. } = request;
         let limits = &self.config.limits;
         let longest = Duration::from_millis(limits.act_deadline_ms_max);
         let usual = Duration::from_millis(limits.act_deadline_ms);
         let patience = deadline.unwrap_or(usual).min(longest);
-        if patience.is_zero() {
+        let stays = timeout.map_or(patience, |timeout| timeout.min(patience));
+        if stays.is_zero() {
             return Err(ServiceError::Deadline { stage: Stage::Admission });
         }
         let acted = |answer, replayed| Acted { answer, replayed, want_planned_states };
@@ -270,7 +271,7 @@ impl Service {
                 (waiter, false)
             }
         };
-        wait(&waiter, arrived + patience).await.map(|answer| acted(answer, replayed))
+        wait(&waiter, arrived + stays).await.map(|answer| acted(answer, replayed))
     }
 
     /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
@@ -308,7 +309,7 @@ impl Service {
         let config = &self.config.sessions;
         let ttl_ms = ttl_ms.unwrap_or(config.ttl_ms);
         if !(1..=config.ttl_ms_max).contains(&ttl_ms) {
-            return Err(ServiceError::invalid(Part::Request, "ttl_ms", format!("must be 1 to {}", config.ttl_ms_max)));
+            return Err(ServiceError::invalid("ttl_ms", format!("must be 1 to {}", config.ttl_ms_max)));
         }
         Ok(Duration::from_millis(ttl_ms))
     }

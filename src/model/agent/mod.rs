@@ -174,6 +174,6 @@ impl Agent {
 }
 
 fn finite(field: &str, value: f32) -> Result<f32, AgentError> {
-    let invalid = || AgentError::InvalidObservation { field: field.into(), reason: format!("{value} is not finite") };
+    let invalid = || AgentError::InvalidObservation { field: field.into(), reason: "is not a finite number".into() };
     if value.is_finite() { Ok(value) } else { Err(invalid()) }
 }

@@ -4,7 +4,7 @@ use super::pb;
 use crate::{
     model::agent::{Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start},
     serve::{
-        error::{Part, ServiceError},
+        error::ServiceError,
         registry::Model,
         request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, OptionsPatch},
         session::{Answer, Summary, Timings},
@@ -30,25 +30,23 @@ fn latent_mode(mode: i32) -> Checked<LatentMode> {
     match pb::LatentMode::try_from(mode) {
         Ok(pb::LatentMode::Mean) => Ok(LatentMode::Mean),
         Ok(pb::LatentMode::Sample) => Ok(LatentMode::Sample),
-        Ok(pb::LatentMode::Unspecified) | Err(_) => Err(ServiceError::invalid(
-            Part::Options,
-            "options.latent",
-            format!("{mode} is neither LATENT_MODE_MEAN nor LATENT_MODE_SAMPLE"),
-        )),
+        Ok(pb::LatentMode::Unspecified) | Err(_) => {
+            Err(ServiceError::invalid("options.latent", format!("{mode} is neither LATENT_MODE_MEAN nor LATENT_MODE_SAMPLE")))
+        }
     }
 }
 
-/// `patience`: what is left of the call's own timeout.
-pub fn act_request(request: pb::ActRequest, patience: Option<Duration>) -> Result<ActRequest, ActResult> {
+/// `timeout`: the call's own.
+pub fn act_request(request: pb::ActRequest, timeout: Option<Duration>) -> Result<ActRequest, ActResult> {
     let pb::ActRequest { session_id, step, observation, deadline_ms, want_planned_states } = request;
-    let deadline = deadline_ms.map(|ms| Duration::from_millis(ms.into())).into_iter().chain(patience).min();
+    let deadline = deadline_ms.map(|ms| Duration::from_millis(ms.into()));
     match observation {
         Some(observation) => {
             let observation = self::observation(observation);
-            Ok(ActRequest { session_id, step, observation, deadline, want_planned_states, face: Face::Grpc })
+            Ok(ActRequest { session_id, step, observation, deadline, timeout, want_planned_states, face: Face::Grpc })
         }
         None => {
-            let result = Err(ServiceError::invalid(Part::Observation, "observation", "is missing"));
+            let result = Err(ServiceError::invalid("observation", "is missing"));
             Err(ActResult { session_id, step, result })
         }
     }

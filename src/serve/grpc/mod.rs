@@ -12,7 +12,7 @@ pub mod pb {
 }
 
 use crate::serve::{
-    error::{Part, ServiceError, Stage},
+    error::{ServiceError, Stage},
     request::ActResult,
     service::Service,
 };
@@ -77,7 +77,7 @@ fn unreadable(code: Code, limit: usize) -> ServiceError {
         metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
         ServiceError::TooLarge { what: "bytes of a message", limit }
     } else {
-        ServiceError::invalid(Part::Request, "message", "is not the protobuf message that belongs here")
+        ServiceError::invalid("message", "is not the protobuf message that belongs here")
     }
 }
 
@@ -85,7 +85,7 @@ fn refuse(error: ServiceError) -> Status {
     status(&error)
 }
 
-/// The call's own timeout, `grpc-timeout`: up to eight digits and a unit.
+/// The call's own timeout, `grpc-timeout`: up to eight digits and a unit. When it is over the caller has hung up, whether or not we hear of it.
 fn timeout(metadata: &MetadataMap) -> Option<Duration> {
     let text = metadata.get("grpc-timeout")?.to_str().ok()?;
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
@@ -112,8 +112,8 @@ impl agent_server::Agent for Face {
     }
 
     async fn act(&self, request: Request<pb::ActRequest>) -> Answer<pb::ActResponse> {
-        let patience = timeout(request.metadata());
-        let result = match convert::act_request(request.into_inner(), patience) {
+        let timeout = timeout(request.metadata());
+        let result = match convert::act_request(request.into_inner(), timeout) {
             Ok(act) => self.0.act(act).await,
             Err(misread) => misread.result,
         };
@@ -122,10 +122,10 @@ impl agent_server::Agent for Face {
 
     async fn act_stream(&self, request: Request<Streaming<pb::ActRequest>>) -> Answer<Self::ActStreamStream> {
         self.0.ready().map_err(refuse)?;
-        let patience = timeout(request.metadata());
+        let timeout = timeout(request.metadata());
         let limit = self.0.config().limits.message_bytes_max;
         let acts = request.into_inner().map(move |act| match act {
-            Ok(act) => convert::act_request(act, patience),
+            Ok(act) => convert::act_request(act, timeout),
             Err(status) => Err(ActResult { session_id: String::new(), step: 0, result: Err(unreadable(status.code(), limit)) }),
         });
         let results = self.0.clone().act_stream(acts).map(|result| Ok(convert::act_result(result)));
@@ -133,11 +133,11 @@ impl agent_server::Agent for Face {
     }
 
     async fn act_batch(&self, request: Request<pb::ActBatchRequest>) -> Answer<pb::ActBatchResponse> {
-        let patience = timeout(request.metadata());
-        if patience.is_some_and(|patience| patience.is_zero()) {
+        let timeout = timeout(request.metadata());
+        if timeout.is_some_and(|timeout| timeout.is_zero()) {
             return Err(refuse(ServiceError::Deadline { stage: Stage::Admission }));
         }
-        let acts = request.into_inner().acts.into_iter().map(|act| convert::act_request(act, patience));
+        let acts = request.into_inner().acts.into_iter().map(|act| convert::act_request(act, timeout));
         let results = self.0.act_batch(acts.collect()).await.map_err(refuse)?;
         Ok(Response::new(pb::ActBatchResponse { results: results.into_iter().map(convert::act_result).collect() }))
     }

@@ -2,10 +2,11 @@
 
 use crate::serve::{
     config::Config,
-    error::{Part, ServiceError, Stage},
+    error::{ServiceError, Stage},
 };
 use axum::body::{Body, HttpBody, to_bytes};
 use serde::de::DeserializeOwned;
+use serde_json::error::Category;
 use std::time::Duration;
 use tokio::time::timeout;
 
@@ -34,21 +35,56 @@ pub async fn bytes(body: Body, config: &Config) -> Result<axum::body::Bytes, Ser
 /// A body as `T`.
 ///
 /// # Errors
-/// `Invalid` with the path of the field.
-pub fn parse<T: DeserializeOwned>(bytes: &[u8], part: Part, config: &Config) -> Result<T, ServiceError> {
+/// `Invalid` with the path of the field; what is no JSON at all is a wrong `body`.
+pub fn parse<T: DeserializeOwned>(bytes: &[u8], config: &Config) -> Result<T, ServiceError> {
     let depth_max = config.limits.json_depth_max;
     if depth(bytes) > depth_max {
-        return Err(ServiceError::invalid(part, "body", format!("is nested deeper than {depth_max}")));
+        return Err(ServiceError::invalid("body", format!("is nested deeper than {depth_max}")));
     }
     let mut json = serde_json::Deserializer::from_slice(bytes);
-    let value = serde_path_to_error::deserialize(&mut json).map_err(|error| {
-        let path = error.path().to_string();
-        // "?" stands for a place that has no name yet.
-        let field = path.trim_end_matches(['.', '?']);
-        ServiceError::invalid(part, if field.is_empty() { "body" } else { field }, error.inner().to_string())
-    })?;
-    json.end().map_err(|error| ServiceError::invalid(part, "body", error.to_string()))?;
+    let value = serde_path_to_error::deserialize(&mut json).map_err(|error| misread(bytes, &error))?;
+    json.end().map_err(not_json)?;
     Ok(value)
+}
+
+fn misread(bytes: &[u8], error: &serde_path_to_error::Error<serde_json::Error>) -> ServiceError {
+    let (path, error) = (error.path().to_string(), error.inner());
+    let message = error.to_string();
+    if error.classify() == Category::Data {
+        let place = format!(" at line {} column {}", error.line(), error.column());
+        return unfitting(&path, message.strip_suffix(&place).unwrap_or(&message));
+    }
+    if message.starts_with("number out of range") || stops_at_word(bytes, error) {
+        return unfitting(&path, "is not a finite number");
+    }
+    not_json(error)
+}
+
+/// Whether the reader stopped at a number as other writers of JSON spell it: `NaN`, `Infinity`, `-Infinity` (behind the sign).
+fn stops_at_word(bytes: &[u8], error: &serde_json::Error) -> bool {
+    let line = bytes.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1));
+    let rest = line.and_then(|line| line.get(error.column().saturating_sub(1)..));
+    rest.is_some_and(|rest| rest.starts_with(b"NaN") || rest.starts_with(b"Infinity"))
+}
+
+fn not_json(error: impl std::fmt::Display) -> ServiceError {
+    ServiceError::invalid("body", format!("is not JSON: {error}"))
+}
+
+/// Serde's complaint about what stands at `path`. A name that the path says, or is to say, is not said again.
+pub fn unfitting(path: &str, message: &str) -> ServiceError {
+    // "?" stands for a place that has no name yet.
+    let path = path.trim_end_matches(['.', '?']);
+    let named = |prefix: &str| message.strip_prefix(prefix)?.split_once('`');
+    let inside = |name: &str| if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") };
+    if let Some((name, _)) = named("missing field `") {
+        return ServiceError::invalid(inside(name), "is missing");
+    }
+    if let Some((name, _)) = named("duplicate field `") {
+        return ServiceError::invalid(inside(name), "is there twice");
+    }
+    let reason = named("unknown field `").map_or_else(|| message.to_owned(), |(_, known)| format!("is no field here{known}"));
+    ServiceError::invalid(if path.is_empty() { "body" } else { path }, reason)
 }
 
 /// Deepest nesting of brackets outside of strings.

@@ -4,7 +4,7 @@ use crate::{
     model::agent::{Executed, LatentMode, Observation, SamplerOptions},
     serve::request::{ActRequest, Face, OpenRequest, OptionsPatch},
 };
-use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
+use serde::{Deserialize, Deserializer, Serialize, de};
 use std::time::Duration;
 use utoipa::{IntoParams, ToSchema};
 
@@ -37,7 +37,6 @@ pub struct OptionsBody {
     /// Factor on the standard deviation of all noise.
     temperature: Option<f32>,
     /// Trust region of the zig-zag refinement in nats, or "infinity".
-    #[schema(value_type = Option<f32>)]
     kappa: Option<Kappa>,
     /// `mean` or `sample`.
     #[schema(value_type = Option<String>)]
@@ -45,28 +44,38 @@ pub struct OptionsBody {
 }
 
 /// JSON has no infinity: here it is a word.
-#[derive(Clone, Copy, Debug)]
-struct Kappa(f32);
+#[derive(Clone, Copy, Debug, Serialize, Deserialize, ToSchema)]
+#[serde(untagged, expecting = "expected a finite number or \"infinity\"")]
+enum Kappa {
+    Nats(#[serde(deserialize_with = "finite")] f32),
+    Unbounded(Unbounded),
+}
 
-impl Serialize for Kappa {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        if self.0 == f32::INFINITY { serializer.serialize_str("infinity") } else { serializer.serialize_f32(self.0) }
+/// `"infinity"`.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum Unbounded {
+    Infinity,
+}
+
+/// A number that is finite as f32 too.
+fn finite<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
+    let value = f32::deserialize(deserializer)?;
+    if value.is_finite() { Ok(value) } else { Err(de::Error::custom("is not a finite number")) }
+}
+
+impl From<Kappa> for f32 {
+    fn from(kappa: Kappa) -> Self {
+        match kappa {
+            Kappa::Nats(nats) => nats,
+            Kappa::Unbounded(Unbounded::Infinity) => f32::INFINITY,
+        }
     }
 }
 
-impl<'de> Deserialize<'de> for Kappa {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        #[derive(Deserialize)]
-        #[serde(untagged)]
-        enum Spelled {
-            Number(f32),
-            Word(String),
-        }
-        match Spelled::deserialize(deserializer).map_err(|_| de::Error::custom("expected a number or \"infinity\""))? {
-            Spelled::Number(value) if value.is_finite() => Ok(Self(value)),
-            Spelled::Word(word) if word == "infinity" => Ok(Self(f32::INFINITY)),
-            Spelled::Number(_) | Spelled::Word(_) => Err(de::Error::custom("expected a finite number or \"infinity\"")),
-        }
+impl From<f32> for Kappa {
+    fn from(nats: f32) -> Self {
+        if nats == f32::INFINITY { Self::Unbounded(Unbounded::Infinity) } else { Self::Nats(nats) }
     }
 }
 
@@ -80,7 +89,7 @@ pub struct ActBody {
     step: u64,
     /// What was seen since the last act.
     observation: ObservationBody,
-    /// Time that it may take.
+    /// Time that it may take from its arrival, after which a coarser answer in time is better than none.
     deadline_ms: Option<u32>,
     /// Whether the answer holds `planned_states`.
     want_planned_states: Option<bool>,
@@ -132,6 +141,7 @@ pub struct ResetBody {
 /// ListSessions.
 #[derive(Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
 pub struct ListQuery {
     /// At most this many.
     pub page_size: usize,
@@ -145,7 +155,7 @@ impl From<OpenBody> for OpenRequest {
     fn from(body: OpenBody) -> Self {
         let OpenBody { model, seed, options, ttl_ms } = body;
         let OptionsBody { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = options.unwrap_or_default();
-        let kappa = kappa.map(|Kappa(value)| value);
+        let kappa = kappa.map(f32::from);
         let options = OptionsPatch { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent };
         Self { model: model.unwrap_or_default(), seed, options, ttl_ms }
     }
@@ -166,6 +176,7 @@ impl ActBody {
                 nothing_executed: nothing_executed.unwrap_or(false),
             },
             deadline: deadline_ms.map(|ms| Duration::from_millis(ms.into())),
+            timeout: None,
             want_planned_states: want_planned_states.unwrap_or(false),
             face: Face::Http,
         }
@@ -181,7 +192,7 @@ impl From<&SamplerOptions> for OptionsBody {
             sub_steps: Some(*sub_steps),
             eta: Some(*eta),
             temperature: Some(*temperature),
-            kappa: Some(Kappa(*kappa)),
+            kappa: Some((*kappa).into()),
             latent: Some(*latent),
         }
     }

@@ -3,23 +3,23 @@
 use super::{
     Gate, State,
     answer::{ActAnswer, BatchAnswer, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer},
-    body::{bytes, parse},
+    body::{bytes, parse, unfitting},
     json::{ActBody, BatchBody, ListQuery, OpenBody, ResetBody},
     problem::Problem,
     stream,
 };
 use crate::serve::{
-    error::{Part, ServiceError},
+    error::ServiceError,
     request::{ActResult, ListRequest},
 };
 use axum::{
     Extension, Json, Router,
     body::Body,
     extract::{
-        MatchedPath, Path, Query, Request, State as Shared, WebSocketUpgrade, rejection::QueryRejection,
+        FromRequestParts, MatchedPath, Path, Query, Request, State as Shared, WebSocketUpgrade, rejection::QueryRejection,
         ws::rejection::WebSocketUpgradeRejection,
     },
-    http::StatusCode,
+    http::{HeaderValue, StatusCode, header, request::Parts},
     middleware::{self, Next},
     response::{IntoResponse, Response},
     routing,
@@ -31,10 +31,13 @@ use utoipa_axum::{router::OpenApiRouter, routes};
 type Answer<T> = Result<Json<T>, Problem>;
 
 #[derive(OpenApi)]
-#[openapi(info(
-    title = "Ada-Diffuser",
-    description = "The verbs of an episode; see clients/http/README.md. Errors are application/problem+json."
-))]
+#[openapi(
+    info(
+        title = "Ada-Diffuser",
+        description = "The verbs of an episode; see clients/http/README.md. Errors are application/problem+json."
+    ),
+    components(schemas(Problem))
+)]
 struct Api;
 
 fn documented() -> OpenApiRouter<State> {
@@ -66,6 +69,7 @@ pub fn router(state: State) -> Router {
         .method_not_allowed_fallback(|| async {
             Problem::new(StatusCode::METHOD_NOT_ALLOWED, "METHOD_NOT_ALLOWED", "this path takes other methods; see /openapi.json")
         })
+        .layer(middleware::from_fn(refuse_encoded))
         .layer(middleware::from_fn(name_route))
         .with_state(state)
 }
@@ -79,23 +83,55 @@ async fn name_route(route: Option<MatchedPath>, request: Request, next: Next) ->
     response
 }
 
-async fn read<T: DeserializeOwned>(body: Body, part: Part, state: &State) -> Result<T, Problem> {
+/// Bodies are read as they come: one that is compressed is refused, with the one encoding that is understood (RFC 9110, 15.5.16).
+async fn refuse_encoded(request: Request, next: Next) -> Response {
+    const IDENTITY: HeaderValue = HeaderValue::from_static("identity");
+    if request.headers().get_all(header::CONTENT_ENCODING).iter().all(|encoding| encoding.is_empty() || encoding == IDENTITY) {
+        return next.run(request).await;
+    }
+    let problem = Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "ENCODING_UNSUPPORTED", "send the body without content-encoding");
+    ([(header::ACCEPT_ENCODING, IDENTITY)], problem).into_response()
+}
+
+/// The name in a path; what is not even text is refused like any other wrong field.
+struct Named(String);
+
+impl<S: Send + Sync> FromRequestParts<S> for Named {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        let Path(name) = Path::from_request_parts(parts, state).await.map_err(|error| ServiceError::invalid("path", error.body_text()))?;
+        Ok(Self(name))
+    }
+}
+
+/// Names the parameter at fault, which axum keeps inside.
+fn misread_query(rejection: &QueryRejection) -> ServiceError {
+    type AtParameter = serde_path_to_error::Error<serde::de::value::Error>;
+    let mut causes = std::iter::successors(std::error::Error::source(rejection), |cause| cause.source());
+    match causes.find_map(|cause| cause.downcast_ref::<AtParameter>()) {
+        Some(error) => unfitting(&error.path().to_string(), &error.inner().to_string()),
+        None => ServiceError::invalid("query", rejection.body_text()),
+    }
+}
+
+async fn read<T: DeserializeOwned>(body: Body, state: &State) -> Result<T, Problem> {
     let config = state.service.config();
-    Ok(parse(&bytes(body, config).await?, part, config)?)
+    Ok(parse(&bytes(body, config).await?, config)?)
 }
 
 /// OpenSession
-#[utoipa::path(post, path = "/v1/sessions", request_body = OpenBody, responses((status = 201, body = OpenAnswer), (status = "default", body = Problem)))]
+#[utoipa::path(post, path = "/v1/sessions", request_body = OpenBody, responses((status = 201, description = "The session and its model", body = OpenAnswer), Problem))]
 async fn open_session(Shared(state): Shared<State>, body: Body) -> Result<(StatusCode, Json<OpenAnswer>), Problem> {
-    let request: OpenBody = read(body, Part::Request, &state).await?;
+    let request: OpenBody = read(body, &state).await?;
     let (session, model) = state.service.open(request.into())?;
     Ok((StatusCode::CREATED, Json(OpenAnswer { session: session.into(), model: (&model).into() })))
 }
 
 /// ListSessions
-#[utoipa::path(get, path = "/v1/sessions", params(ListQuery), responses((status = 200, body = ManySessions), (status = "default", body = Problem)))]
+#[utoipa::path(get, path = "/v1/sessions", params(ListQuery), responses((status = 200, description = "A page of sessions, by id", body = ManySessions), Problem))]
 async fn list_sessions(Shared(state): Shared<State>, query: Result<Query<ListQuery>, QueryRejection>) -> Answer<ManySessions> {
-    let Query(query) = query.map_err(|error| ServiceError::invalid(Part::Request, "query", error.body_text()))?;
+    let Query(query) = query.map_err(|error| misread_query(&error))?;
     let ListQuery { page_size, page_token, model } = query;
     let page = state.service.list(&ListRequest { page_size, page_token, model })?;
     let sessions = page.sessions.into_iter().map(Into::into).collect();
@@ -103,49 +139,49 @@ async fn list_sessions(Shared(state): Shared<State>, query: Result<Query<ListQue
 }
 
 /// GetSession
-#[utoipa::path(get, path = "/v1/sessions/{id}", params(("id" = String, Path)), responses((status = 200, body = OneSession), (status = "default", body = Problem)))]
-async fn get_session(Shared(state): Shared<State>, Path(id): Path<String>) -> Answer<OneSession> {
+#[utoipa::path(get, path = "/v1/sessions/{id}", params(("id" = String, Path)), responses((status = 200, description = "The session", body = OneSession), Problem))]
+async fn get_session(Shared(state): Shared<State>, Named(id): Named) -> Answer<OneSession> {
     Ok(Json(OneSession { session: state.service.get(&id)?.into() }))
 }
 
 /// CloseSession
-#[utoipa::path(delete, path = "/v1/sessions/{id}", params(("id" = String, Path)), responses((status = 204), (status = "default", body = Problem)))]
-async fn close_session(Shared(state): Shared<State>, Path(id): Path<String>) -> Result<StatusCode, Problem> {
+#[utoipa::path(delete, path = "/v1/sessions/{id}", params(("id" = String, Path)), responses((status = 204, description = "It is closed"), Problem))]
+async fn close_session(Shared(state): Shared<State>, Named(id): Named) -> Result<StatusCode, Problem> {
     state.service.close(&id)?;
     Ok(StatusCode::NO_CONTENT)
 }
 
 /// ResetSession
 #[utoipa::path(post, path = "/v1/sessions/{id}/reset", params(("id" = String, Path)), request_body = ResetBody,
-    responses((status = 200, body = OneSession), (status = "default", body = Problem)))]
-async fn reset_session(Shared(state): Shared<State>, Path(id): Path<String>, body: Body) -> Answer<OneSession> {
+    responses((status = 200, description = "The session", body = OneSession), Problem))]
+async fn reset_session(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Answer<OneSession> {
     let config = state.service.config();
     let bytes = bytes(body, config).await?;
-    let ResetBody { seed, keep_history } = if bytes.is_empty() { ResetBody::default() } else { parse(&bytes, Part::Request, config)? };
+    let ResetBody { seed, keep_history } = if bytes.is_empty() { ResetBody::default() } else { parse(&bytes, config)? };
     let session = state.service.reset(&id, seed, keep_history.unwrap_or(false))?;
     Ok(Json(OneSession { session: session.into() }))
 }
 
 /// Act
 #[utoipa::path(post, path = "/v1/sessions/{id}/act", params(("id" = String, Path)), request_body = ActBody,
-    responses((status = 200, body = ActAnswer), (status = "default", body = Problem)))]
-async fn act(Shared(state): Shared<State>, Path(id): Path<String>, body: Body) -> Answer<ActAnswer> {
-    let body: ActBody = read(body, Part::Observation, &state).await?;
+    responses((status = 200, description = "The action chunk, and what is known about it", body = ActAnswer), Problem))]
+async fn act(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Answer<ActAnswer> {
+    let body: ActBody = read(body, &state).await?;
     if body.session_id.as_ref().is_some_and(|other| *other != id) {
-        return Err(ServiceError::invalid(Part::Request, "session_id", "differs from the path").into());
+        return Err(ServiceError::invalid("session_id", "differs from the path").into());
     }
     Ok(Json((&state.service.act(body.into_request(id)).await?).into()))
 }
 
 /// ActStream, a WebSocket: each text message is an act, each answer a result
-#[utoipa::path(get, path = "/v1/sessions/{id}/stream", params(("id" = String, Path)), responses((status = 101), (status = "default", body = Problem)))]
+#[utoipa::path(get, path = "/v1/sessions/{id}/stream", params(("id" = String, Path)), responses((status = 101, description = "A WebSocket"), Problem))]
 async fn act_stream(
     Shared(state): Shared<State>,
-    Path(id): Path<String>,
+    Named(id): Named,
     Extension(gate): Extension<Gate>,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
-    let upgrade = upgrade.map_err(|error| ServiceError::invalid(Part::Request, "headers", error.body_text()))?;
+    let upgrade = upgrade.map_err(|error| ServiceError::invalid("headers", error.body_text()))?;
     state.service.ready()?;
     state.service.get(&id)?;
     let limit = state.service.config().limits.message_bytes_max;
@@ -154,13 +190,13 @@ async fn act_stream(
 }
 
 /// ActBatch
-#[utoipa::path(post, path = "/v1/act:batch", request_body = BatchBody, responses((status = 200, body = BatchAnswer), (status = "default", body = Problem)))]
+#[utoipa::path(post, path = "/v1/act:batch", request_body = BatchBody, responses((status = 200, description = "An answer or an error for each act, in their order", body = BatchAnswer), Problem))]
 async fn act_batch(Shared(state): Shared<State>, body: Body) -> Answer<BatchAnswer> {
-    let body: BatchBody = read(body, Part::Observation, &state).await?;
+    let body: BatchBody = read(body, &state).await?;
     let acts = body.acts.into_iter().map(|mut act| {
         let session_id = act.session_id.take();
         let act = act.into_request(session_id.clone().unwrap_or_default());
-        let missing = || ServiceError::invalid(Part::Request, "session_id", "is missing");
+        let missing = || ServiceError::invalid("session_id", "is missing");
         if session_id.is_some() { Ok(act) } else { Err(ActResult { session_id: String::new(), step: act.step, result: Err(missing()) }) }
     });
     let results = state.service.act_batch(acts.collect()).await?;
@@ -168,26 +204,26 @@ async fn act_batch(Shared(state): Shared<State>, body: Body) -> Answer<BatchAnsw
 }
 
 /// Models.List
-#[utoipa::path(get, path = "/v1/models", responses((status = 200, body = ManyModels), (status = "default", body = Problem)))]
+#[utoipa::path(get, path = "/v1/models", responses((status = 200, description = "All models, by name", body = ManyModels), Problem))]
 async fn list_models(Shared(state): Shared<State>) -> Answer<ManyModels> {
     Ok(Json(ManyModels { models: state.service.models()?.iter().map(Into::into).collect() }))
 }
 
 /// Models.Get
 #[utoipa::path(get, path = "/v1/models/{name}", params(("name" = String, Path, description = "name or name@digest")),
-    responses((status = 200, body = OneModel), (status = "default", body = Problem)))]
-async fn get_model(Shared(state): Shared<State>, Path(name): Path<String>) -> Answer<OneModel> {
+    responses((status = 200, description = "The model", body = OneModel), Problem))]
+async fn get_model(Shared(state): Shared<State>, Named(name): Named) -> Answer<OneModel> {
     Ok(Json(OneModel { model: (&state.service.model(&name)?).into() }))
 }
 
 /// Whether the process works: its engine shows signs of life
-#[utoipa::path(get, path = "/livez", responses((status = 200, body = String), (status = 503, body = String)))]
+#[utoipa::path(get, path = "/livez", responses((status = 200, description = "It works", body = String), (status = 503, description = "The engine is silent", body = String)))]
 async fn livez(Shared(state): Shared<State>) -> Response {
     if state.service.is_alive() { "ok\n".into_response() } else { (StatusCode::SERVICE_UNAVAILABLE, "engine is silent\n").into_response() }
 }
 
 /// Whether it takes work: models loaded, not draining
-#[utoipa::path(get, path = "/readyz", responses((status = 200, body = String), (status = 503, body = String)))]
+#[utoipa::path(get, path = "/readyz", responses((status = 200, description = "It takes work", body = String), (status = 503, description = "Why not", body = String)))]
 async fn readyz(Shared(state): Shared<State>) -> Response {
     match state.service.ready() {
         Ok(()) => "ok\n".into_response(),
@@ -196,7 +232,7 @@ async fn readyz(Shared(state): Shared<State>) -> Response {
 }
 
 /// Metrics as Prometheus text
-#[utoipa::path(get, path = "/metrics", responses((status = 200, body = String)))]
+#[utoipa::path(get, path = "/metrics", responses((status = 200, description = "The text format of Prometheus", body = String)))]
 async fn metrics(Shared(state): Shared<State>) -> Response {
     state.service.refresh_gauges();
     ([("content-type", "text/plain; version=0.0.4")], state.metrics.render()).into_response()

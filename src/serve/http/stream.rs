@@ -2,7 +2,6 @@
 
 use super::{Gate, State, answer::ResultAnswer, body::parse, json::ActBody};
 use crate::serve::{
-    error::Part,
     request::{ActRequest, ActResult},
     service::Service,
 };
@@ -42,7 +41,7 @@ fn acts(
     service: Arc<Service>,
     session_id: String,
 ) -> impl Stream<Item = Result<ActRequest, ActResult>> {
-    let read = move |bytes: &[u8]| match parse::<ActBody>(bytes, Part::Observation, service.config()) {
+    let read = move |bytes: &[u8]| match parse::<ActBody>(bytes, service.config()) {
         Ok(mut body) => {
             let session_id = body.session_id.take().unwrap_or_else(|| session_id.clone());
             Ok(body.into_request(session_id))

@@ -1,7 +1,7 @@
 //! Every row of the error table that a client can bring about, on both faces. (The rest, row by row, stands in the unit tests of the two tables.)
 
 use super::*;
-use ada_diffuser::serve::{grpc, registry::Registry, service::Service};
+use ada_diffuser::serve::{grpc, http, registry::Registry, service::Service, telemetry};
 use std::sync::Arc;
 
 /// The same failure on both faces; the gRPC side first.
@@ -54,7 +54,28 @@ async fn unknown_sessions_and_models() {
     let grpc = server.agent().await.open_session(pb::OpenSessionRequest { model: "x".into(), ..Default::default() }).await.unwrap_err();
     both(&grpc, &server.post("/v1/sessions", &json!({"model": "x"})).await, (Code::NotFound, 404, "MODEL_NOT_FOUND"));
     let grpc = server.models().await.get(pb::GetModelRequest { model: "x".into() }).await.unwrap_err();
-    both(&grpc, &server.get("/v1/models/x").await, (Code::NotFound, 404, "MODEL_NOT_FOUND"));
+    let http = server.get("/v1/models/x").await;
+    both(&grpc, &http, (Code::NotFound, 404, "MODEL_NOT_FOUND"));
+    let expected = r#"no model "x"; there are: exploding, slow, tiny"#;
+    assert_eq!((grpc.message(), http.json()["detail"].as_str()), (expected, Some(expected)));
+    let other = server.get("/v1/models/tiny@00000000").await.json()["detail"].as_str().unwrap().to_owned();
+    assert!(other.contains("the digest of tiny is "), "{other}");
+}
+
+/// A compressed body was read as if it were JSON, and called a wrong observation.
+#[tokio::test(flavor = "multi_thread")]
+async fn bodies_come_uncompressed() {
+    use tower::ServiceExt;
+    let service = Arc::new(Service::start(config().validated().unwrap()).unwrap());
+    let state = http::State { service, metrics: telemetry::install_metrics() };
+    for (encoding, expected) in [("gzip", 415), ("br", 415), ("identity", 503), ("", 503)] {
+        let request = hyper::Request::builder().method("POST").uri("/v1/sessions").header("content-encoding", encoding);
+        let response = http::router(state.clone()).oneshot(request.body(Body::from("{}")).unwrap()).await.unwrap();
+        assert_eq!(response.status().as_u16(), expected, "{encoding}");
+        let accepted = response.headers().get("accept-encoding").map(|value| value.to_str().unwrap());
+        assert_eq!(accepted, (expected == 415).then_some("identity"));
+        assert_eq!(response.headers()["content-type"], "application/problem+json");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -130,28 +151,38 @@ async fn json_that_does_not_fit() {
     let server = start(|config| config.limits.json_depth_max = 8).await;
     let id = server.open(json!({})).await;
     let deep = format!(r#"{{"step":1,"observation":{{"state":{}1{}}}}}"#, "[".repeat(9), "]".repeat(9));
-    for (body, field) in [
-        ("", "body"),
-        ("{", "body"),
-        ("[]", "body"),
-        ("null", "body"),
-        (r#"{"step":1}"#, "body"),
-        (r#"{"step":1,"observation":{"state":[0,0,0,0]}} x"#, "body"),
-        (r#"{"step":-1,"observation":{"state":[0,0,0,0]}}"#, "step"),
-        (r#"{"step":1.5,"observation":{"state":[0,0,0,0]}}"#, "step"),
-        (r#"{"step":1,"observation":{"state":[0,0,0,"NaN"]}}"#, "observation.state[3]"),
-        (r#"{"step":1,"observation":{"state":[0,0,0,null]}}"#, "observation.state[3]"),
-        (r#"{"step":1,"observation":{"state":[0,0,0,1e999]}}"#, "observation.state[3]"),
-        (r#"{"step":1,"observation":{"state":[0,0,0,1e39]}}"#, "observation.state[3]"),
-        (r#"{"step":1,"observation":{"state":[0,0,0,NaN]}}"#, "observation.state[3]"),
-        (r#"{"step":1,"observation":{"state":[0,0,0,0],"goal":1}}"#, "observation.goal"),
-        (r#"{"step":1,"step":1,"observation":{"state":[0,0,0,0]}}"#, "body"),
-        (r#"{"step":1,"observation":{"state":[0,0,0,0],"executed":[{"actions":[0,0]}]}}"#, "observation.executed[0].actions"),
-        (deep.as_str(), "body"),
+    let (request, observation) = ("REQUEST_INVALID", "OBSERVATION_INVALID");
+    for (body, reason, field) in [
+        ("", request, "body"),
+        ("{", request, "body"),
+        ("[]", request, "body"),
+        ("null", request, "body"),
+        (r#"{"step":1}"#, observation, "observation"),
+        (r#"{"observation":{"state":[0,0,0,0]}}"#, request, "step"),
+        (r#"{"step":1,"observation":{}}"#, observation, "observation.state"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0]}} x"#, request, "body"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0"#, request, "body"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,x]}}"#, request, "body"),
+        (r#"{"step":-1,"observation":{"state":[0,0,0,0]}}"#, request, "step"),
+        (r#"{"step":1.5,"observation":{"state":[0,0,0,0]}}"#, request, "step"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0]},"deadline_ms":12.5}"#, request, "deadline_ms"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0]},"goal":1}"#, request, "goal"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,"NaN"]}}"#, observation, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,null]}}"#, observation, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,1e999]}}"#, observation, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,1e39]}}"#, observation, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,NaN]}}"#, observation, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,-Infinity]}}"#, observation, "observation.state[3]"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0],"goal":1}}"#, observation, "observation.goal"),
+        (r#"{"step":1,"step":1,"observation":{"state":[0,0,0,0]}}"#, request, "step"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0],"executed":[{"actions":[0,0]}]}}"#, observation, "observation.executed[0].actions"),
+        (deep.as_str(), request, "body"),
     ] {
         let reply = server.http("POST", &format!("/v1/sessions/{id}/act"), body).await;
-        assert_eq!((reply.status, reply.reason().as_str()), (400, "OBSERVATION_INVALID"), "{body}");
+        assert_eq!((reply.status, reply.reason().as_str()), (400, reason), "{body}");
         assert_eq!(reply.json()["field"], field, "{body}: {}", reply.text);
+        let detail = reply.json()["detail"].as_str().unwrap().to_owned();
+        assert!(detail.starts_with(&format!("{field}: ")) && !detail[field.len()..].contains(field), "named once: {detail}");
     }
     let reply = server.http("POST", &format!("/v1/sessions/{id}/act"), r#"{"session_id":"x","step":1,"observation":{"state":[]}}"#).await;
     assert_eq!((reply.status, reply.json()["field"].as_str().unwrap()), (400, "session_id"));
@@ -190,7 +221,26 @@ async fn requests_and_options_that_do_not_fit() {
     let token = pb::ListSessionsRequest { page_token: "x".into(), ..Default::default() };
     let grpc = server.agent().await.list_sessions(token).await.unwrap_err();
     both(&grpc, &server.get("/v1/sessions?page_token=x").await, (Code::InvalidArgument, 400, "REQUEST_INVALID"));
-    assert_eq!(server.get("/v1/sessions?page=1").await.reason(), "REQUEST_INVALID");
+    for (path, field) in [
+        ("/v1/sessions?page=1", "page"),
+        ("/v1/sessions?page_size=many", "page_size"),
+        ("/v1/sessions?page_size=1&page_size=2", "page_size"),
+        ("/v1/sessions/%ff", "path"),
+        ("/v1/models/%ff", "path"),
+    ] {
+        let reply = server.get(path).await;
+        assert_eq!((reply.reason().as_str(), reply.json()["field"].as_str()), ("REQUEST_INVALID", Some(field)), "{path}: {reply:?}");
+    }
+    for (body, field) in [
+        (r#"{"options":{"latent":"median"}}"#, "options.latent"),
+        (r#"{"options":{"sub_steps":-1}}"#, "options.sub_steps"),
+        (r#"{"options":{"kappa":1e39}}"#, "options.kappa"),
+        (r#"{"options":{"kappa":"much"}}"#, "options.kappa"),
+        (r#"{"options":{"kapa":1}}"#, "options.kapa"),
+    ] {
+        let reply = server.http("POST", "/v1/sessions", body).await;
+        assert_eq!((reply.reason().as_str(), reply.json()["field"].as_str()), ("OPTIONS_INVALID", Some(field)), "{body}: {reply:?}");
+    }
     assert_eq!(server.get("/v1/nothing").await.status, 404);
     assert_eq!(server.get("/v1/act:batch").await.reason(), "METHOD_NOT_ALLOWED");
 }
@@ -245,30 +295,39 @@ async fn a_full_queue_and_passed_deadlines() {
     assert_eq!(server.act(&third, 1, &STATE).await.status, 200, "nothing is lost");
 }
 
-/// The call's own timeout counts like `deadline_ms`. (Without a socket: a stock client would end the call by itself at the same moment.)
+/// A timeout of the call means the same on both faces: when it is over, the caller has hung up. Once gRPC's was taken for a `deadline_ms`, and a
+/// client with a short one got degraded answers that it had not asked for. (Without a socket: a stock client would end the call by itself at the
+/// same moment.)
 #[tokio::test(flavor = "multi_thread")]
-async fn the_timeout_of_a_grpc_call() {
+async fn a_timeout_of_a_call_is_no_deadline() {
     let mut config = config().validated().unwrap();
-    config.engine.anytime = false;
+    // Tests of deadlines keep time for a machine that does other things too.
+    config.engine.deadline_margin_ms = 200;
     let registry = Registry::load(&config.models).unwrap();
     let service = Arc::new(Service::start(config).unwrap());
+    service.warm_up(&registry);
     service.set_registry(registry);
     let (router, _) = grpc::router(service).unwrap();
     let mut agent = AgentClient::new(router);
     let open = pb::OpenSessionRequest { model: "slow".into(), ..Default::default() };
     let id = agent.open_session(open).await.unwrap().into_inner().session.unwrap().session_id;
-    for deadline_ms in [None, Some(60_000)] {
+    let mut ask = async |deadline_ms, grpc_timeout: &str| {
         let mut request = tonic::Request::new(pb::ActRequest { deadline_ms, ..act(&id, 1, &STATE) });
-        request.metadata_mut().insert("grpc-timeout", "300m".parse().unwrap());
-        let late = timeout(Duration::from_secs(10), agent.act(request)).await.expect("it was not heard").unwrap_err();
-        assert_eq!(failure(&late), (Code::DeadlineExceeded, "DEADLINE_COMPUTE".into()));
+        request.metadata_mut().insert("grpc-timeout", grpc_timeout.parse().unwrap());
+        timeout(Duration::from_secs(10), agent.act(request)).await.expect("it was not heard").map(tonic::Response::into_inner)
+    };
+    for (deadline_ms, grpc_timeout) in [(None, "300m"), (Some(60_000), "300m"), (None, "0n")] {
+        let late = ask(deadline_ms, grpc_timeout).await.unwrap_err();
+        let stage = if grpc_timeout == "0n" { "DEADLINE_ADMISSION" } else { "DEADLINE_COMPUTE" };
+        assert_eq!(failure(&late), (Code::DeadlineExceeded, stage.into()), "{deadline_ms:?}");
     }
+    assert!(ask(Some(800), "60S").await.unwrap().degraded, "it asked for that");
 }
 
 /// Rather than nothing, an act with a deadline gets a coarser answer in time, which says so and is repeated like any other.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_deadline_gets_a_degraded_answer() {
-    let server = start(|_| {}).await;
+    let server = start(|config| config.engine.deadline_margin_ms = 200).await;
     let body = json!({"step": 1, "observation": {"state": STATE}, "deadline_ms": 500});
     let id = server.open(json!({"model": "slow"})).await;
     let answer = server.post(&format!("/v1/sessions/{id}/act"), &body).await;

@@ -116,6 +116,15 @@ async fn the_faces_describe_themselves() {
     ];
     assert_eq!(paths, expected);
     assert!(api["components"]["schemas"]["ActBody"]["properties"]["observation"].is_object());
+    for (path, methods) in api["paths"].as_object().unwrap() {
+        for (method, operation) in methods.as_object().unwrap() {
+            for (status, response) in operation["responses"].as_object().unwrap() {
+                let described = response["description"].as_str().is_some_and(|text| !text.is_empty());
+                let errors = status != "default" || response["content"]["application/problem+json"].is_object();
+                assert!(described && errors, "{method} {path} {status}: {response}");
+            }
+        }
+    }
     use tonic_reflection::pb::v1::{
         ServerReflectionRequest, server_reflection_client::ServerReflectionClient, server_reflection_request::MessageRequest,
     };

@@ -55,7 +55,7 @@ async fn the_web_socket_speaks_the_same() {
     let again = say(json!({"step": 1, "observation": {"state": STATE}}).to_string()).await;
     assert_eq!(again["response"]["replayed"], true);
     let broken = say("{".into()).await;
-    assert_eq!((&broken["error"]["reason"], &broken["session_id"]), (&json!("OBSERVATION_INVALID"), &json!(id)));
+    assert_eq!((&broken["error"]["reason"], &broken["session_id"]), (&json!("REQUEST_INVALID"), &json!(id)));
     let early = say(json!({"step": 9, "observation": {"state": STATE}}).to_string()).await;
     assert_eq!((&early["error"]["reason"], &early["error"]["committed_step"]), (&json!("STEP_OUT_OF_ORDER"), &json!(1)));
     let next = say(json!({"step": 2, "observation": {"state": STATE}}).to_string()).await;
