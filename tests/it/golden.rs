@@ -88,6 +88,6 @@ fn what_follows(agent: &Agent, act: usize, chunk: &Chunk, stream: &mut Philox) -
     let state = if act % 16 == 9 { drawn_state(agent, stream) } else { near };
     let reward = agent.config().normalizer.reward.mean[0] + stream.normal();
     let step = |action: &Vec<f32>| Executed { reward: Some(reward), action: (act % 3 == 2).then(|| action.clone()), state: None };
-    let executed = if act % 5 == 0 { Vec::new() } else { chunk.actions.iter().map(step).collect() };
+    let executed = if act.is_multiple_of(5) { Vec::new() } else { chunk.actions.iter().map(step).collect() };
     Observation { state, executed, ..Observation::default() }
 }

@@ -181,7 +181,7 @@ class Chunk:
     replayed: bool
     #: `(action_horizon, action_dim)`.
     actions: Floats
-    #: `(plan_horizon, state_dim)`, if asked for.
+    #: `(plan_horizon - 1, state_dim)`, if asked for: states after the chunk's last action.
     planned_states: Floats | None
     #: Mean of the latent at the chunk's first step, `(latent_dim,)`.
     latent_mean: Floats

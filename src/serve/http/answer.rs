@@ -23,7 +23,7 @@ pub struct ActAnswer {
     replayed: bool,
     /// `(action_horizon, action_dim)`.
     actions: Vec<Vec<f32>>,
-    /// `(plan_horizon, state_dim)`, if asked for.
+    /// `(plan_horizon - 1, state_dim)`, if asked for: states after the chunk's last action.
     #[serde(skip_serializing_if = "Option::is_none")]
     planned_states: Option<Vec<Vec<f32>>>,
     latent_mean: Vec<f32>,
