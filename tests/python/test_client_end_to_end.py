@@ -261,7 +261,7 @@ def test_wrong_input_is_named_alike_by_both_faces(address: str) -> None:
         with Client(f"{face}://{address}") as client, client.open_session(seed=1) as session:
             wrong_acts = [
                 ([0.0] * 3, ()),
-                ([0.0] * 4, (Executed(),)),
+                ([0.0] * 4, (Executed(action=[0.0] * 3),)),
                 ([0.0] * 4, (Executed(action=[0.0]),)),
             ]
             for state, executed in wrong_acts:
