@@ -99,7 +99,11 @@ mod tests {
     fn scale_does_not_depend_on_the_unit() {
         for unit in [1e-9, 1e-3, 1.0, 1e6] {
             let rows: Vec<f32> = (0..100).flat_map(|i| [unit * (i % 7) as f32, 5.0 * unit]).collect();
-            let affine = Affine::fit(2, |visit| Ok::<_, ()>(visit(&rows))).unwrap();
+            let affine = Affine::fit(2, |visit| {
+                visit(&rows);
+                Ok::<_, ()>(())
+            })
+            .unwrap();
             assert!((affine.std[0] / unit - 2.0).abs() < 0.1, "{affine:?}");
             assert_eq!(affine.std[1], 1.0);
             let normalized = affine.normalize(&rows);

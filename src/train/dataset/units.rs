@@ -241,7 +241,10 @@ mod tests {
 
     /// A scan of a few rows at a time.
     fn shown(values: &[f32]) -> impl Fn(Visit) -> io::Result<()> {
-        |visit| Ok(values.chunks(7).for_each(visit))
+        |visit| {
+            values.chunks(7).for_each(visit);
+            Ok(())
+        }
     }
 
     fn columns(config: &ActionsConfig, values: &[f32]) -> ActionColumn {
