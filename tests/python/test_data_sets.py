@@ -501,7 +501,7 @@ def test_the_way_out_of_lerobot(tmp_path):
 
 @pytest.mark.parametrize(("scale", "shift"), [(1 / 128, 0), (1, 100), (4096, -(2**20))])
 def test_actions_in_another_unit_train_the_same_bits(plain: str, tmp_path: Path, scale: float, shift: float) -> None:
-    """Bounds began at -1 and 1 and only grew: actions a hundred times smaller were learnt with an error of .59 instead of .006, in silence."""
+    """Bounds began at -1 and 1 and only grew: actions a hundred times smaller were learnt with an error of .59 not .006, in silence."""
     columns = arrays()
     columns["actions"] = (columns["actions"] * scale + shift).astype(np.float32)
     assert log(write(tmp_path / "other.h5", columns), tmp_path / "out") == plain
