@@ -86,8 +86,8 @@ impl Default for Restart {
 }
 
 impl ModelConfig {
-    /// Plain units (no normalization, actions in [-1, 1]), every gap and chunk trained, and defaults for everything but the sizes that must be said: where tests,
-    /// benches and examples start.
+    /// Plain units (no normalization, actions in [-1, 1]), every gap and chunk trained, and defaults for everything but the sizes that must
+    /// be said: where tests, benches and examples start.
     pub fn plain(layout: Layout, latent: Option<LatentConfig>, denoiser: DenoiserConfig) -> Self {
         Self {
             layout,

@@ -228,7 +228,7 @@ fn data_sets_are_read_and_split() {
     assert_ne!(digests[0].digest, digests[1].digest);
 }
 
-/// All rows were held in memory, four times over, so a data set larger than that could not be trained on. Kept in a file they give the
+/// All rows were held in memory, more than once, so a data set larger than that could not be trained on. Kept in a file they give the
 /// same weights, config and log, over a stop too, and nothing is left behind.
 #[test]
 fn rows_in_a_file_train_the_same_bits() {
