@@ -11,7 +11,7 @@
 //!
 //! ```text
 //! bin/server -> serve -> model <- train <- bin/trainer        serve and train never meet
-//! model: noise, trajectory <- normalizer <- nn <- {latent | denoiser} <- diffusion <- agent <- checkpoint
+//! model: noise, trajectory <- normalizer <- nn <- {latent | denoiser} <- diffusion <- agent <- checkpoint; check: the one check of a model
 //! ```
 //! Only `model` and `train` know candle; only `serve` knows tokio, tonic, axum and the clock; tests in `tests/it` read the source and hold
 //! these borders.

@@ -8,9 +8,8 @@ use ada_diffuser::{
         telemetry,
     },
 };
-use anyhow::Context;
 use clap::Parser;
-use std::path::PathBuf;
+use std::{path::PathBuf, process::ExitCode};
 use tokio::signal::unix::{SignalKind, signal};
 
 /// Serves Ada-Diffuser models over gRPC and REST on one port.
@@ -52,8 +51,18 @@ impl Flags {
     }
 }
 
-fn main() -> anyhow::Result<()> {
-    let flags = Flags::parse();
+fn main() -> ExitCode {
+    match run(Flags::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            // Each cause once, and no backtrace, which is how `main` itself would tell it.
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(flags: Flags) -> anyhow::Result<()> {
     if let Err(error) = restart::with_environment(&restart::ONE_THREAD_EACH) {
         eprintln!("warning: could not start anew with one thread for each product ({error}); serving will be slower");
     }
@@ -64,7 +73,7 @@ fn main() -> anyhow::Result<()> {
         let shutdown = shutdown()?;
         let server = Server::bind(config).await?;
         tracing::info!(address = %server.address()?, "listening");
-        server.run(shutdown).await.context("ada-server")
+        Ok(server.run(shutdown).await?)
     });
     // Whatever still runs after the hard end of the drain must not keep the process.
     runtime.shutdown_background();

@@ -10,14 +10,20 @@ use ada_diffuser::train::{
 };
 use anyhow::{Context, Result, anyhow};
 use clap::Parser;
-use std::path::PathBuf;
-use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::{sync::Arc, thread, time::SystemTime};
+use std::{
+    io::{self, Write},
+    path::PathBuf,
+    process::ExitCode,
+    sync::Arc,
+    sync::atomic::{AtomicBool, AtomicU8, Ordering},
+    thread,
+    time::SystemTime,
+};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 fn main() -> ExitCode {
     start(Cli::parse()).unwrap_or_else(|error| {
-        eprintln!("error: {error:#}");
+        tell(&format!("error: {}", report::message(&error)));
         ExitCode::FAILURE
     })
 }
@@ -34,31 +40,68 @@ fn start(cli: Cli) -> Result<ExitCode> {
 }
 
 fn run(flags: Run) -> Result<ExitCode> {
-    let mut overrides = flags.overrides;
-    overrides.extend(flags.seed.map(|seed| format!("seed={seed}")));
-    overrides.extend(flags.data.map(|path| format!("data={:?}", path.display().to_string())));
-    let recipe = Recipe::read(&flags.recipe, &overrides)?;
-    let out = flags.out.unwrap_or_else(|| PathBuf::from("runs").join(format!("{}-seed{}", recipe.name, recipe.seed)));
-    let stop = Arc::new(AtomicBool::new(false));
+    let Run { recipe, seed, out, data, mut overrides, stop_after_steps, data_memory_mib, keep_best } = flags;
+    overrides.extend(seed.map(|seed| format!("seed={seed}")));
+    let recipe = Recipe::read(&recipe, &overrides, data.as_deref())?;
+    let out = out.unwrap_or_else(|| PathBuf::from("runs").join(format!("{}-seed{}", recipe.name, recipe.seed)));
+    let (stop, signal) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU8::new(0)));
     thread::spawn({
-        let stop = stop.clone();
-        move || interrupted(&stop)
+        let (stop, signal) = (stop.clone(), signal.clone());
+        move || await_signals(&stop, &signal)
     });
     let clock = Box::new(|| SystemTime::UNIX_EPOCH.elapsed().map_or(0.0, |time| time.as_secs_f64()));
-    let (stop_after_steps, data_memory_mib) = (flags.stop_after_steps, flags.data_memory_mib);
-    let outcome = train::run(recipe, Options { out, stop_after_steps, stop: stop.clone(), data_memory_mib, clock })?;
-    let interrupted = outcome == Outcome::Stopped && stop.load(Ordering::Relaxed);
-    Ok(if interrupted { ExitCode::from(130) } else { ExitCode::SUCCESS })
+    let outcome = train::run(recipe, Options { out, stop_after_steps, keep_best, stop, data_memory_mib, clock })?;
+    let signal = signal.load(Ordering::Relaxed);
+    Ok(if outcome == Outcome::Stopped && signal > 0 { ExitCode::from(128 + signal) } else { ExitCode::SUCCESS })
 }
 
-/// The first Ctrl-C saves the state and ends, the second ends at once.
-fn interrupted(stop: &AtomicBool) {
+/// The first SIGINT (Ctrl-C), SIGTERM or SIGHUP saves the state and ends, the second ends at once. `first` is what shells add to 128 for a
+/// process that a signal ended.
+fn await_signals(stop: &AtomicBool, first: &AtomicU8) {
     let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_io().build() else { return };
-    while runtime.block_on(tokio::signal::ctrl_c()).is_ok() {
-        if stop.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
+    runtime.block_on(async {
+        let [mut interrupt, mut terminate] = [SignalKind::interrupt(), SignalKind::terminate()].map(|kind| signal(kind).ok());
+        let mut hangup = if is_ignored(SignalKind::hangup()) { None } else { signal(SignalKind::hangup()).ok() };
+        loop {
+            let number = tokio::select! {
+                () = received(&mut interrupt) => SignalKind::interrupt(),
+                () = received(&mut terminate) => SignalKind::terminate(),
+                () = received(&mut hangup) => SignalKind::hangup(),
+            };
+            let number = number.as_raw_value() as u8;
+            if stop.swap(true, Ordering::Relaxed) {
+                std::process::exit(128 + i32::from(number));
+            }
+            first.store(number, Ordering::Relaxed);
+            tell("stopping after this step; once more to stop at once");
         }
-        eprintln!("stopping after this step; once more to stop at once");
+    });
+}
+
+async fn received(signal: &mut Option<Signal>) {
+    match signal {
+        Some(signal) => drop(signal.recv().await),
+        None => std::future::pending().await,
+    }
+}
+
+/// Whether this process was started with the signal ignored, as `nohup` does with SIGHUP: then it must stay so.
+fn is_ignored(kind: SignalKind) -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask >> (kind.as_raw_value() - 1) & 1 == 1)
+}
+
+/// A line for the user; a terminal that hung up has none, and that is no reason to end.
+fn tell(text: &str) {
+    let _nobody_reads = writeln!(io::stderr(), "{text}");
+}
+
+/// A result; a reader that has seen enough (`| head`) is no error.
+fn print(text: &str) -> Result<ExitCode> {
+    match writeln!(io::stdout(), "{text}") {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(error).context("standard output"),
+        _ => Ok(ExitCode::SUCCESS),
     }
 }
 
@@ -66,12 +109,10 @@ fn probe(flags: &Probe) -> Result<ExitCode> {
     let room = Room::new(flags.data_memory_mib, std::env::temp_dir());
     let (scores, notes) = report::probe(&flags.checkpoint, &flags.data, &room)?;
     notes.iter().for_each(|note| eprintln!("{note}"));
-    println!("{}", if flags.json { serde_json::to_string_pretty(&scores)? } else { report::probe_table(&scores) });
-    Ok(ExitCode::SUCCESS)
+    print(&if flags.json { serde_json::to_string_pretty(&scores)? } else { report::probe_table(&scores) })
 }
 
 fn inspect(flags: &Inspect) -> Result<ExitCode> {
     let value = report::inspect(&flags.checkpoint)?;
-    println!("{}", if flags.json { serde_json::to_string_pretty(&value)? } else { report::inspect_text(&value) });
-    Ok(ExitCode::SUCCESS)
+    print(&if flags.json { serde_json::to_string_pretty(&value)? } else { report::inspect_text(&value) })
 }

@@ -1,24 +1,21 @@
 //! config.json + model.safetensors + manifest.json <-> [`Agent`]; the only file access of this room.
 //!
 //! safetensors itself accepts NaN, flipped bits and an 88 MB header, so everything is checked against the manifest, and the networks
-//! must ask for exactly the tensors that are there.
+//! must ask for exactly the tensors that are there. Then one act is tried: finite weights can still give numbers that are not.
+mod files;
 
 use crate::model::{
     Networks,
-    agent::Agent,
+    agent::{Agent, Observation},
     config::ModelConfig,
-    nn::{Params, Precision},
+    nn::{Params, Precision, plain},
 };
 use candle_core::{Device, Tensor};
+use files::Files;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-use std::{
-    collections::BTreeMap,
-    fs,
-    io::{Read, Write},
-    path::Path,
-};
+use std::{collections::BTreeMap, path::Path};
 
 /// Version of the three files; a reader refuses others.
 pub const FORMAT_VERSION: u32 = 1;
@@ -30,16 +27,26 @@ const HEADER_BYTES_MAX: u64 = 1 << 20;
 /// Largest weight file, in bytes.
 const WEIGHT_BYTES_MAX: u64 = 1 << 30;
 
+/// Longest name of a model, in characters.
+pub const NAME_LEN_MAX: usize = 64;
+
+/// Whether the server serves a checkpoint in a directory of this name: 1 to 64 of `A-Z a-z 0-9 _ . -`, which need no escape in a URL,
+/// and no `@`, which parts a name from a digest; and not `.` or `..`, which are other directories.
+pub fn is_name(name: &str) -> bool {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || "_.-".contains(c);
+    (1..=NAME_LEN_MAX).contains(&name.len()) && name.chars().all(allowed) && !name.chars().all(|c| c == '.')
+}
+
 /// Why a checkpoint was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// A file could not be read or written.
-    #[error("{path}: {source}")]
+    #[error("{path}: {reason}")]
     Io {
         /// The file.
         path: String,
         /// What the system said.
-        source: std::io::Error,
+        reason: String,
     },
     /// The content is not what the manifest promises or the model needs.
     #[error("{path}: {reason}")]
@@ -91,24 +98,49 @@ pub struct TensorDigest {
     pub sha256: String,
 }
 
-/// Writes a checkpoint: each file beside its place and renamed, the manifest last, so that a torn write is refused by the loader.
+impl Manifest {
+    /// The manifest in these bytes, read from `path`.
+    fn parse(path: &Path, bytes: &[u8]) -> Result<Self, CheckpointError> {
+        let manifest: Self = serde_json::from_slice(bytes).map_err(|error| invalid(path, error.to_string()))?;
+        if manifest.format_version != FORMAT_VERSION {
+            return Err(invalid(path, format!("format version {}, this program reads {FORMAT_VERSION}", manifest.format_version)));
+        }
+        Ok(manifest)
+    }
+
+    /// Gives the bytes back if they are the file that it calls `name`.
+    fn check_digest(&self, name: &str, path: &Path, bytes: Vec<u8>) -> Result<Vec<u8>, CheckpointError> {
+        match self.files.get(name) {
+            Some(expected) if *expected == sha256(&bytes) => Ok(bytes),
+            Some(_) => Err(invalid(path, format!("SHA-256 differs from {MANIFEST}"))),
+            None => Err(invalid(path, format!("is not in {MANIFEST}"))),
+        }
+    }
+}
+
+/// Writes a checkpoint, in the place of another where there is one: it is written beside, loaded and asked for an act, and only then takes
+/// the place, in one step. Whatever goes wrong, and whenever the process is killed, `dir` holds the old checkpoint or the new one.
 ///
 /// # Errors
-/// If a file cannot be written or a tensor is not f32.
+/// If a file cannot be written, or what was written would not [`load`].
 pub fn save(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>, provenance: &Provenance) -> Result<(), CheckpointError> {
-    fs::create_dir_all(dir).map_err(|source| io(dir, source))?;
+    encode(dir, config, tensors, provenance)?.replace(dir, |written| agent(dir, written, Precision::F32).map(|_| ()))
+}
+
+fn encode(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>, provenance: &Provenance) -> Result<Files, CheckpointError> {
     let config = pretty(config, &dir.join(CONFIG))?;
     let (weights, digests) = serialize_tensors(tensors).map_err(|reason| invalid(&dir.join(WEIGHTS), reason))?;
-    let files = [(CONFIG, &config), (WEIGHTS, &weights)].map(|(name, bytes)| (name.to_string(), sha256(bytes)));
+    let digest = |name: &str, bytes: &[u8]| (name.to_string(), sha256(bytes));
+    let files = [digest(CONFIG, &config), digest(WEIGHTS, &weights)];
     let manifest = Manifest { format_version: FORMAT_VERSION, files: files.into(), tensors: digests, provenance: provenance.clone() };
     let manifest = pretty(&manifest, &dir.join(MANIFEST))?;
-    [(CONFIG, config), (WEIGHTS, weights), (MANIFEST, manifest)].iter().try_for_each(|(name, bytes)| replace(&dir.join(name), bytes))
+    Ok(Files { config, weights, manifest })
 }
 
 /// Reads, checks and builds the agent in this directory.
 ///
 /// # Errors
-/// If a file is missing, a digest differs, a tensor is missing, superfluous, of another shape, or not finite.
+/// If a file is missing, a digest differs, a tensor is missing, superfluous, of another shape, or not finite, or an act is not finite.
 pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
     load_as(dir, Precision::F32)
 }
@@ -118,34 +150,46 @@ pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
 /// # Errors
 /// As [`load`].
 pub fn load_as(dir: &Path, precision: Precision) -> Result<Agent, CheckpointError> {
-    let (manifest, digest) = load_manifest(dir)?;
-    let config: ModelConfig = parse(&dir.join(CONFIG), &read(&dir.join(CONFIG), HEADER_BYTES_MAX)?, &manifest)?;
-    config.check().map_err(|reason| invalid(&dir.join(CONFIG), reason))?;
-    let path = dir.join(WEIGHTS);
-    let weights = read(&path, WEIGHT_BYTES_MAX)?;
-    check_digest(&path, &weights, &manifest)?;
-    let tensors = read_tensors(&weights, &manifest).map_err(|reason| invalid(&path, reason))?;
+    agent(dir, &read_files(dir)?, precision)
+}
+
+/// The files of a checkpoint, also of one that is replaced while it is read.
+fn read_files(dir: &Path) -> Result<Files, CheckpointError> {
+    let before = load_manifest(dir)?.1;
+    let found = Files::read(dir);
+    let is_replaced = || load_manifest(dir).is_ok_and(|(_, now)| now != before);
+    if found.is_err() && is_replaced() { Files::read(dir) } else { found }
+}
+
+/// Checks all of it and builds the agent; `dir` is for messages.
+fn agent(dir: &Path, files: &Files, precision: Precision) -> Result<Agent, CheckpointError> {
+    let (config_path, path) = (dir.join(CONFIG), dir.join(WEIGHTS));
+    let manifest = Manifest::parse(&dir.join(MANIFEST), &files.manifest)?;
+    let config: ModelConfig = serde_json::from_slice(&files.config).map_err(|error| invalid(&config_path, error.to_string()))?;
+    config.check().map_err(|unfit| invalid(&config_path, unfit.to_string()))?;
+    let tensors = read_tensors(&files.weights, &manifest).map_err(|reason| invalid(&path, reason))?;
     let params = Params::loaded_as(tensors, precision);
-    let networks = Networks::new(&config, &params).map_err(|error| invalid(&path, error.to_string()))?;
+    let networks = Networks::new(&config, &params).map_err(|error| invalid(&path, plain(&error)))?;
     if let Some(name) = params.unused().first() {
         return Err(invalid(&path, format!("tensor {name} belongs to no network of {CONFIG}")));
     }
-    let agent = Agent::new(config, networks, digest);
-    agent.open(0, &agent.config().sampler).map_err(|error| invalid(&dir.join(CONFIG), format!("sampler: {error}")))?;
+    let agent = Agent::new(config, networks, sha256(&files.manifest));
+    let first = Observation { state: agent.config().normalizer.state.mean.clone(), ..Observation::default() };
+    let act = agent.open(0, &agent.config().sampler).and_then(|episode| agent.act(&episode, &first));
+    act.map_err(|error| invalid(&path, format!("a first act fails: {error}")))?;
     Ok(agent)
 }
 
-/// Writes the checkpoint of `dir` into `out` with the same weights and origin and another configuration, e.g. other sampling defaults.
+/// Writes the checkpoint of `dir` into `out` (it may be the same) with the same weights and origin and another configuration, e.g. other
+/// sampling defaults.
 ///
 /// # Errors
 /// As [`load`] and [`save`].
 pub fn copy_with(dir: &Path, out: &Path, config: &ModelConfig) -> Result<(), CheckpointError> {
-    load(dir)?;
-    let (manifest, _) = load_manifest(dir)?;
-    let path = dir.join(WEIGHTS);
-    let tensors = read_tensors(&read(&path, WEIGHT_BYTES_MAX)?, &manifest).map_err(|reason| invalid(&path, reason))?;
-    save(out, config, &tensors, &manifest.provenance)?;
-    load(out).map(|_| ())
+    let files = read_files(dir)?;
+    let manifest = Manifest::parse(&dir.join(MANIFEST), &files.manifest)?;
+    let tensors = read_tensors(&files.weights, &manifest).map_err(|reason| invalid(&dir.join(WEIGHTS), reason))?;
+    save(out, config, &tensors, &manifest.provenance)
 }
 
 /// The manifest of a checkpoint and its own SHA-256, which names the checkpoint.
@@ -154,12 +198,8 @@ pub fn copy_with(dir: &Path, out: &Path, config: &ModelConfig) -> Result<(), Che
 /// If it is missing, no manifest, or of another format version.
 pub fn load_manifest(dir: &Path) -> Result<(Manifest, String), CheckpointError> {
     let path = dir.join(MANIFEST);
-    let bytes = read(&path, HEADER_BYTES_MAX)?;
-    let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|error| invalid(&path, error.to_string()))?;
-    if manifest.format_version != FORMAT_VERSION {
-        return Err(invalid(&path, format!("format version {}, this program reads {FORMAT_VERSION}", manifest.format_version)));
-    }
-    Ok((manifest, sha256(&bytes)))
+    let bytes = files::read(&path, HEADER_BYTES_MAX)?;
+    Ok((Manifest::parse(&path, &bytes)?, sha256(&bytes)))
 }
 
 fn serialize_tensors(tensors: &BTreeMap<String, Tensor>) -> Result<(Vec<u8>, BTreeMap<String, TensorDigest>), String> {
@@ -206,54 +246,18 @@ fn read_tensors(bytes: &[u8], manifest: &Manifest) -> Result<BTreeMap<String, Te
     Ok(tensors)
 }
 
-fn parse<T: for<'de> Deserialize<'de>>(path: &Path, bytes: &[u8], manifest: &Manifest) -> Result<T, CheckpointError> {
-    check_digest(path, bytes, manifest)?;
-    serde_json::from_slice(bytes).map_err(|error| invalid(path, error.to_string()))
-}
-
-fn check_digest(path: &Path, bytes: &[u8], manifest: &Manifest) -> Result<(), CheckpointError> {
-    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-    match manifest.files.get(name) {
-        Some(expected) if *expected == sha256(bytes) => Ok(()),
-        Some(_) => Err(invalid(path, format!("SHA-256 differs from {MANIFEST}"))),
-        None => Err(invalid(path, format!("is not in {MANIFEST}"))),
-    }
-}
-
 fn pretty<T: Serialize>(value: &T, path: &Path) -> Result<Vec<u8>, CheckpointError> {
     let mut bytes = serde_json::to_vec_pretty(value).map_err(|error| invalid(path, error.to_string()))?;
     bytes.push(b'\n');
     Ok(bytes)
 }
 
-fn read(path: &Path, bytes_max: u64) -> Result<Vec<u8>, CheckpointError> {
-    let file = fs::File::open(path).map_err(|source| io(path, source))?;
-    let mut bytes = Vec::new();
-    file.take(bytes_max + 1).read_to_end(&mut bytes).map_err(|source| io(path, source))?;
-    if bytes.len() as u64 > bytes_max {
-        return Err(invalid(path, format!("larger than {bytes_max} bytes")));
-    }
-    Ok(bytes)
-}
-
-/// Writes beside the file, syncs, renames.
-fn replace(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
-    let beside = path.with_extension("partial");
-    let write = || {
-        let mut file = fs::File::create(&beside)?;
-        file.write_all(bytes)?;
-        file.sync_all()?;
-        fs::rename(&beside, path)
-    };
-    write().map_err(|source| io(path, source))
-}
-
 fn sha256(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-fn io(path: &Path, source: std::io::Error) -> CheckpointError {
-    CheckpointError::Io { path: path.display().to_string(), source }
+fn io(path: &Path, error: &std::io::Error) -> CheckpointError {
+    CheckpointError::Io { path: path.display().to_string(), reason: error.to_string() }
 }
 
 fn invalid(path: &Path, reason: impl Into<String>) -> CheckpointError {

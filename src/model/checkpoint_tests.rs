@@ -1,7 +1,10 @@
 //! A checkpoint is what was saved, or it is refused with the reason.
 
-use super::*;
-use std::path::PathBuf;
+use super::{
+    files::{STEPS, Step},
+    *,
+};
+use std::{fs, path::PathBuf};
 
 fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("models/tiny")
@@ -83,16 +86,73 @@ fn other_tensors_are_refused() {
     assert!(load(dir.path()).is_err());
 }
 
+/// Files of `models/tiny` with another temperature and one tensor times `factor`.
+fn other(temperature: f32, factor: f64) -> Files {
+    let (mut config, manifest) = (load(&tiny()).unwrap().config().clone(), load_manifest(&tiny()).unwrap().0);
+    config.sampler.temperature = temperature;
+    let mut tensors = read_tensors(&fs::read(tiny().join(WEIGHTS)).unwrap(), &manifest).unwrap();
+    let name = "denoiser.input_skip.weight";
+    tensors.insert(name.into(), tensors[name].affine(factor, 0.0).unwrap());
+    encode(&tiny(), &config, &tensors, &manifest.provenance).unwrap()
+}
+
+fn verify(written: &Files) -> Result<(), CheckpointError> {
+    agent(Path::new("."), written, Precision::F32).map(|_| ())
+}
+
+/// Does the first `count` steps of a replacement and half of the next write: what a process leaves that is killed there.
+fn killed_after(dir: &Path, files: &Files, count: usize) {
+    STEPS[..count].iter().for_each(|step| files.take(*step, dir, verify).unwrap());
+    if let Some(Step::Write(name)) = STEPS.get(count) {
+        fs::write(dir.join(format!("{name}.next")), vec![0; 1000]).unwrap();
+    }
+}
+
+/// A kill between the renames of the three files left a checkpoint that was refused. Now a kill at any step of a replacement, and again at
+/// any step of the replacement after it, leaves one of the checkpoints whole; and what is finished leaves nothing else behind.
 #[test]
-fn values_that_are_not_finite_are_refused() {
-    let dir = copy();
-    let agent = load(dir.path()).unwrap();
-    let (manifest, _) = load_manifest(dir.path()).unwrap();
-    let mut tensors = read_tensors(&fs::read(dir.path().join(WEIGHTS)).unwrap(), &manifest).unwrap();
-    let name = "denoiser.input_skip.bias";
-    tensors.insert(name.into(), tensors[name].affine(f64::NAN, 0.0).unwrap());
-    save(dir.path(), agent.config(), &tensors, &manifest.provenance).unwrap();
-    assert!(refusal(dir.path()).contains("NaN"));
+fn a_kill_at_any_moment_leaves_a_checkpoint() {
+    let (first, second, third) = (sha256(&fs::read(tiny().join(MANIFEST)).unwrap()), other(0.25, 1.5), other(0.75, 0.5));
+    let switch = STEPS.iter().position(|step| *step == Step::Rename(MANIFEST)).unwrap();
+    let digest = |dir: &Path| load(dir).unwrap_or_else(|error| panic!("{error}")).spec().digest.clone();
+    for count in 0..=STEPS.len() {
+        for again in 0..=STEPS.len() {
+            let dir = copy();
+            killed_after(dir.path(), &second, count);
+            let left = if count > switch { sha256(&second.manifest) } else { first.clone() };
+            assert_eq!(digest(dir.path()), left, "killed after {count}");
+            killed_after(dir.path(), &third, again);
+            let expected = if again > switch { sha256(&third.manifest) } else { left };
+            assert_eq!(digest(dir.path()), expected, "killed after {count}, then after {again}");
+            second.replace(dir.path(), verify).unwrap();
+            assert_eq!(digest(dir.path()), sha256(&second.manifest));
+            assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 3, "nothing is left over");
+        }
+    }
+}
+
+/// What would be refused when it is loaded never takes the place of a good checkpoint: neither tensors that are no numbers, nor finite
+/// ones whose first act is none.
+#[test]
+fn what_would_not_load_is_not_written() {
+    for (factor, words) in [(f64::NAN, "NaN"), (1e38, "act")] {
+        let dir = copy();
+        let (mut config, manifest) = (load(dir.path()).unwrap().config().clone(), load_manifest(dir.path()).unwrap().0);
+        config.sampler.temperature = 1.0;
+        let mut tensors = read_tensors(&fs::read(dir.path().join(WEIGHTS)).unwrap(), &manifest).unwrap();
+        tensors.values_mut().for_each(|tensor| *tensor = tensor.affine(factor, 0.0).unwrap().clamp(-3e38, 3e38).unwrap());
+        let error = save(dir.path(), &config, &tensors, &manifest.provenance).unwrap_err().to_string();
+        assert!(error.contains(words), "{error}");
+        assert_eq!(load(dir.path()).unwrap().spec().digest, load(&tiny()).unwrap().spec().digest);
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 3, "nothing is left over");
+    }
+}
+
+/// HalfCheetah-v5 could be trained and not be served.
+#[test]
+fn names_are_those_of_environments_too() {
+    assert!(["HalfCheetah-v5-seed0", "point-wind-s", "a", "v1.2_x"].iter().all(|name| is_name(name)));
+    assert!(["", ".", "..", "a b", "a/b", "a@b", "é", "%41"].iter().all(|name| !is_name(name)));
 }
 
 #[test]
@@ -122,4 +182,20 @@ fn other_versions_and_unknown_fields_are_refused() {
     let dir = copy();
     edit(dir.path(), |_, config| config["level_max"] = 4.into());
     assert!(refusal(dir.path()).contains("level_max"));
+}
+
+/// A level table of 10^12 entries ended the server by lack of memory, a history of 10^6 steps its acts; now they are refused by name.
+#[test]
+fn absurd_sizes_are_refused_by_name() {
+    for (field, value) in [("level_max", 1_u64 << 40), ("block_len", 1_000_000), ("obs_horizon", 1 << 40), ("plan_horizon", 1 << 20)] {
+        let dir = copy();
+        edit(dir.path(), |_, config| config[field] = value.into());
+        assert!(refusal(dir.path()).contains(&format!("{field}: is {value}")), "{}", refusal(dir.path()));
+    }
+    let dir = copy();
+    edit(dir.path(), |_, config| config["sampler"]["sub_steps"] = ((1_u64 << 61) + 1).into());
+    assert!(refusal(dir.path()).contains("sampler.sub_steps"));
+    let dir = copy();
+    edit(dir.path(), |_, config| config["latent"]["hidden"] = 8000.into());
+    assert!(refusal(dir.path()).contains("parameters"), "{}", refusal(dir.path()));
 }

@@ -1,7 +1,7 @@
 //! What a model is, apart from its weights: the content of a checkpoint's `config.json`.
 
 use crate::model::{
-    agent::SamplerOptions,
+    agent::{SamplerOptions, infinity_as_null},
     denoiser::DenoiserConfig,
     latent::LatentConfig,
     normalizer::{Affine, Normalizer},
@@ -67,15 +67,19 @@ pub struct Missing {
     pub reward: bool,
 }
 
-/// When a stored window is noised again or thrown away. Distances of states are root mean squares in standard deviations of the data.
+/// When a stored window is noised again or thrown away. Distances of states are root mean squares in standard deviations of the data;
+/// infinity (`null` in JSON) is never.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Restart {
     /// From this distance between the real and the predicted state on, the window is noised again by a quarter of its rungs.
+    #[serde(with = "infinity_as_null")]
     pub renoise_distance: f32,
     /// From this distance on, it starts cold.
+    #[serde(with = "infinity_as_null")]
     pub cold_distance: f32,
     /// It starts cold when the latent of position 0 has moved by more than this many `latent_spread`s since the last cold start.
+    #[serde(with = "infinity_as_null")]
     pub latent_jump: f32,
 }
 
@@ -114,46 +118,6 @@ impl ModelConfig {
             restart: Restart::default(),
             sampler: SamplerOptions::default(),
         }
-    }
-
-    /// Whether the sizes fit together; the networks check their own.
-    ///
-    /// # Errors
-    /// A message that names the field.
-    pub fn check(&self) -> Result<(), String> {
-        let (state, action) = (self.layout.state_dim, self.layout.action_dim);
-        let widths = [
-            ("normalizer.state", self.normalizer.state.dim(), state),
-            ("normalizer.state.std", self.normalizer.state.std.len(), state),
-            ("normalizer.state_change_std", self.normalizer.state_change_std.len(), state),
-            ("normalizer.action", self.normalizer.action.dim(), action),
-            ("normalizer.action.std", self.normalizer.action.std.len(), action),
-            ("normalizer.reward", self.normalizer.reward.dim(), 1),
-            ("normalizer.reward.std", self.normalizer.reward.std.len(), 1),
-            ("action_low", self.action_low.len(), action),
-            ("action_high", self.action_high.len(), action),
-        ];
-        if let Some((field, found, expected)) = widths.iter().find(|(_, found, expected)| found != expected) {
-            return Err(format!("{field} has {found} columns, expected {expected}"));
-        }
-        let scales = [&self.normalizer.state, &self.normalizer.action, &self.normalizer.reward];
-        if scales.iter().any(|affine| affine.std.iter().any(|std| !std.is_normal() || *std < 0.0)) {
-            return Err("normalizer: a scale is zero, negative or not finite".into());
-        }
-        if scales.iter().any(|affine| affine.mean.iter().any(|mean| !mean.is_finite())) {
-            return Err("normalizer: a mean is not finite".into());
-        }
-        let Restart { renoise_distance, cold_distance, latent_jump } = self.restart;
-        if [renoise_distance, cold_distance, latent_jump, self.latent_spread].iter().any(|value| value.is_nan() || *value < 0.0) {
-            return Err("restart and latent_spread must not be negative or NaN".into());
-        }
-        if self.action_low.iter().zip(&self.action_high).any(|(low, high)| low > high || !low.is_finite() || !high.is_finite()) {
-            return Err("action_low must not be above action_high".into());
-        }
-        if self.plan_horizon == 0 || self.obs_horizon == 0 || self.block_len == 0 || self.state_clip.is_nan() || self.state_clip <= 0.0 {
-            return Err("plan_horizon, obs_horizon, block_len and state_clip must be positive".into());
-        }
-        Ok(())
     }
 
     /// Executed actions in the units of the networks, `action_dim` values: held within their bounds, as those of training are.

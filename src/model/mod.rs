@@ -1,5 +1,6 @@
 //! What Ada-Diffuser is: tensors in, tensors out. No clock, no thread, no socket, no hidden randomness.
 pub mod agent;
+pub mod check;
 pub mod checkpoint;
 pub mod config;
 pub mod denoiser;

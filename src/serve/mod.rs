@@ -34,12 +34,12 @@ const ENGINE_PATIENCE: Duration = Duration::from_secs(2);
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
     /// The address is taken or not ours, or nobody knows the name.
-    #[error("server.listen {address}: {source}")]
+    #[error("server.listen {address}: {reason}")]
     Listen {
         /// The setting.
         address: String,
         /// What the system said.
-        source: io::Error,
+        reason: String,
     },
     /// No threads for the engine.
     #[error("engine: {0}")]
@@ -48,7 +48,7 @@ pub enum ServerError {
     #[error(transparent)]
     Models(#[from] RegistryError),
     /// The build's descriptors are broken.
-    #[error("reflection: {0}")]
+    #[error("reflection")]
     Reflection(#[from] grpc::ReflectionError),
 }
 
@@ -66,7 +66,7 @@ impl Server {
     pub async fn bind(config: Config) -> Result<Self, ServerError> {
         match listen(&config.server.listen).await {
             Ok(listener) => Ok(Self { listener, config }),
-            Err(source) => Err(ServerError::Listen { address: config.server.listen, source }),
+            Err(error) => Err(ServerError::Listen { address: config.server.listen, reason: error.to_string() }),
         }
     }
 

@@ -8,7 +8,6 @@ use std::{collections::BTreeMap, fs, io, path::Path, path::PathBuf, sync::Arc, t
 
 /// Digits of a digest that a client must at least name.
 const DIGEST_PREFIX_MIN: usize = 8;
-const NAME_LEN_MAX: usize = 64;
 /// Names that an error lists.
 const NAMES_SHOWN: usize = 20;
 
@@ -33,12 +32,12 @@ pub struct Registry {
 #[derive(Debug, thiserror::Error)]
 pub enum RegistryError {
     /// The directory cannot be read.
-    #[error("models.dir {dir}: {source}")]
+    #[error("models.dir {dir}: {reason}")]
     Dir {
         /// The directory.
         dir: PathBuf,
         /// What the system said.
-        source: io::Error,
+        reason: String,
     },
     /// No checkpoint in it could be loaded.
     #[error("models.dir {dir} holds no checkpoint that can be loaded")]
@@ -62,7 +61,8 @@ impl Registry {
     /// # Errors
     /// If the directory cannot be read, or no checkpoint or not the default one could be loaded.
     pub fn load(config: &ModelsConfig) -> Result<Self, RegistryError> {
-        let dirs = checkpoint_dirs(&config.dir).map_err(|source| RegistryError::Dir { dir: config.dir.clone(), source })?;
+        let dirs =
+            checkpoint_dirs(&config.dir).map_err(|error| RegistryError::Dir { dir: config.dir.clone(), reason: error.to_string() })?;
         let loaded = dirs.iter().filter_map(|(name, dir)| load_one(name, dir, config.weights)).map(|(name, agent)| {
             let is_default = *name == *config.default;
             (name.clone(), Model { name, agent, is_default })
@@ -92,7 +92,8 @@ impl Registry {
             None => (reference, None),
         };
         let name = if name.is_empty() { &*self.default } else { name };
-        let not_found = |instead| ServiceError::ModelNotFound { model: reference.chars().take(2 * NAME_LEN_MAX).collect(), instead };
+        let not_found =
+            |instead| ServiceError::ModelNotFound { model: reference.chars().take(2 * checkpoint::NAME_LEN_MAX).collect(), instead };
         let model = self.models.get(name).ok_or_else(|| not_found(format!("there are: {}", names(&self.models))))?;
         let actual = &model.agent.spec().digest;
         let is_meant = digest.is_none_or(|digest| digest.len() >= DIGEST_PREFIX_MIN && actual.starts_with(digest));
@@ -119,18 +120,13 @@ fn checkpoint_dirs(dir: &Path) -> io::Result<Vec<(Arc<str>, PathBuf)>> {
         if !path.join("config.json").is_file() {
             continue;
         }
-        match path.file_name().and_then(|name| name.to_str()).filter(|name| is_name(name)) {
+        match path.file_name().and_then(|name| name.to_str()).filter(|name| checkpoint::is_name(name)) {
             Some(name) => found.push((Arc::from(name), path)),
-            None => refuse(&path.to_string_lossy(), "name", &"its name must be 1 to 64 of a-z 0-9 _ . -"),
+            None => refuse(&path.to_string_lossy(), "name", &"its name must be 1 to 64 of A-Z a-z 0-9 _ . -"),
         }
     }
     found.sort();
     Ok(found)
-}
-
-fn is_name(name: &str) -> bool {
-    let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "_.-".contains(c);
-    (1..=NAME_LEN_MAX).contains(&name.len()) && name.chars().all(allowed)
 }
 
 fn load_one(name: &Arc<str>, dir: &Path, weights: Precision) -> Option<(Arc<str>, Arc<Agent>)> {
@@ -153,4 +149,24 @@ fn load_one(name: &Arc<str>, dir: &Path, weights: Precision) -> Option<(Arc<str>
 fn refuse(name: &str, reason: &'static str, error: &dyn std::fmt::Display) {
     metrics::counter!("ada_checkpoint_rejected_total", "reason" => reason).increment(1);
     tracing::error!(model = name, %error, "checkpoint refused");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// HalfCheetah-v5 is trained under this name, and was refused under it.
+    #[test]
+    fn names_of_environments_are_served() {
+        let dir = tempfile::tempdir().unwrap();
+        let name = "HalfCheetah-v5-seed0";
+        fs::create_dir(dir.path().join(name)).unwrap();
+        for file in ["config.json", "model.safetensors", "manifest.json"] {
+            fs::copy(Path::new("models/tiny").join(file), dir.path().join(name).join(file)).unwrap();
+        }
+        let config = ModelsConfig { dir: dir.path().into(), default: name.into(), ..ModelsConfig::default() };
+        let registry = Registry::load(&config).unwrap();
+        let digest = registry.get(name).unwrap().agent.spec().digest.clone();
+        assert_eq!(&*registry.get(&format!("{name}@{}", &digest[..12])).unwrap().name, name);
+    }
 }

@@ -2,14 +2,13 @@
 
 use super::flags::Defaults;
 use crate::model::{
-    agent::Agent,
     checkpoint::{copy_with, load},
     config::ModelConfig,
 };
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use serde_json::Value;
 
-/// Copies the checkpoint with the given keys of `sampler` and `restart` changed.
+/// Copies the checkpoint with the given keys of `sampler` and `restart` changed; with a wrong one nothing is written.
 ///
 /// # Errors
 /// If the checkpoint is refused, or a key or value is none of the model's.
@@ -20,8 +19,8 @@ pub fn defaults(flags: &Defaults) -> Result<()> {
     let agent = load(&flags.checkpoint)?;
     let mut config = serde_json::to_value(agent.config())?;
     flags.overrides.iter().try_for_each(|text| set(&mut config, text))?;
-    let config: ModelConfig = serde_json::from_value(config)?;
-    check(&agent, &config)?;
+    let config: ModelConfig = serde_path_to_error::deserialize(config).map_err(|error| anyhow!("{}: {}", error.path(), error.inner()))?;
+    config.check()?;
     Ok(copy_with(&flags.checkpoint, &flags.out, &config)?)
 }
 
@@ -38,9 +37,4 @@ fn set(config: &mut Value, text: &str) -> Result<()> {
         _ => serde_json::from_str(value).unwrap_or_else(|_| Value::String(value.into())),
     };
     Ok(())
-}
-
-/// The new defaults must be options that a session could ask for.
-fn check(agent: &Agent, config: &ModelConfig) -> Result<()> {
-    agent.open(0, &config.sampler).map(|_| ()).context("sampler")
 }

@@ -10,16 +10,21 @@ use std::path::PathBuf;
 ///   ada-trainer inspect runs/point-wind-s
 ///   ada-trainer defaults runs/point-wind-s models/point-wind-s --set sampler.kappa=0.1
 ///
-/// Data sets are HDF5 files in D4RL's layout, for example from `ada-collect`; docs/data.md says what they hold. A run that was stopped (Ctrl-C, kill -9) goes on by
-/// the same command, with the same bits as if it had never stopped.
+/// Data sets are HDF5 files in D4RL's layout, for example from `ada-collect`; docs/data.md says what they hold. A run that was stopped
+/// (Ctrl-C, SIGTERM, SIGHUP, kill -9) goes on by the same command, with the same bits as if it had never stopped. What it logs lies in
+/// OUT/training: log.jsonl, a JSON object a line, and TensorBoard's files, for `tensorboard --logdir runs`; both with the held-out loss at
+/// every checkpoint.
 #[derive(Parser)]
 #[command(version, verbatim_doc_comment)]
 pub enum Cli {
-    /// Train a recipe, or go on with it: stage 1 (what cannot be seen), its gate, stage 2 (denoise and refine), checkpoint
+    /// Train a recipe, or go on with it: stage 1 (what cannot be seen), its gate, stage 2 (denoise and refine), checkpoint.
+    ///
+    /// A run that goes on may be given another stage1.steps (in stage 1), stage2.steps, checkpoint_every or log_every, and its data set may
+    /// have moved; other keys are refused by name. Log and TensorBoard files are in OUT/training.
     Run(Run),
     /// How well a checkpoint's latent knows the hidden context that a data set tells (infos/context)
     Probe(Probe),
-    /// Check a checkpoint and say what it is: architecture, origin, recipe, measurements
+    /// Check a checkpoint and say what it is: what is in force (sampler, restart, what was trained), origin, recipe, measurements
     Inspect(Inspect),
     /// Copy a checkpoint with other sampling defaults, chosen on validation episodes
     Defaults(Defaults),
@@ -42,6 +47,9 @@ pub struct Run {
     /// Another value for a key of the recipe, e.g. --set stage2.steps=100; may be given often
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub overrides: Vec<String>,
+    /// Keep the checkpoint of the least held-out loss of stage 2 as well, in OUT-best beside OUT; it is served like any other
+    #[arg(long)]
+    pub keep_best: bool,
     /// Stop after this many steps as if interrupted; the same command goes on
     #[arg(long, value_name = "N")]
     pub stop_after_steps: Option<usize>,

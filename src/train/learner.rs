@@ -3,7 +3,7 @@
 use super::{
     Task,
     optimizer::{Adam, Ema},
-    resume::{Position, Snapshot, Stage, State, restore_vars},
+    resume::{Notes, Position, Snapshot, Stage, State, restore_vars},
     stage1::attempt_seed,
 };
 use crate::model::{Networks, nn::params::Params};
@@ -31,8 +31,8 @@ pub struct Learner {
     pub ema: Option<Ema>,
     /// How far.
     pub position: Position,
-    /// Results of the gate so far.
-    pub probes: serde_json::Value,
+    /// What the run has found out so far.
+    pub notes: Notes,
 }
 
 impl Learner {
@@ -46,7 +46,7 @@ impl Learner {
         let vars = params.vars();
         let stage = if task.recipe.stage1.is_some() { Stage::Latent } else { Stage::Refine };
         let (adam, ema) = equip(task, stage, &vars)?;
-        Ok(Self { networks, vars, adam, ema, position: Position { stage, attempt, step: 0 }, probes: serde_json::json!([]) })
+        Ok(Self { networks, vars, adam, ema, position: Position { stage, attempt, step: 0, before: 0 }, notes: Notes::default() })
     }
 
     /// The learner of a state on disk.
@@ -62,7 +62,7 @@ impl Learner {
             ema.restore(&state.tensors)?;
         }
         learner.position = state.position;
-        learner.probes = state.probes;
+        learner.notes = state.notes;
         Ok(learner)
     }
 
@@ -72,13 +72,13 @@ impl Learner {
     /// If a tensor operation fails.
     pub fn enter(&mut self, task: &Task, stage: Stage) -> Result<()> {
         (self.adam, self.ema) = equip(task, stage, &self.vars)?;
-        self.position = Position { stage, step: 0, ..self.position };
+        self.position = self.position.then(stage, self.position.attempt);
         Ok(())
     }
 
     /// What is to be saved.
     pub fn snapshot(&self) -> Snapshot<'_> {
-        Snapshot { position: self.position, probes: &self.probes, vars: &self.vars, adam: &self.adam, ema: self.ema.as_ref() }
+        Snapshot { position: self.position, notes: &self.notes, vars: &self.vars, adam: &self.adam, ema: self.ema.as_ref() }
     }
 
     /// The averaged networks and their tensors: what is shipped.

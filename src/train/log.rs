@@ -1,17 +1,25 @@
 //! What a run says: JSON lines and TensorBoard on disk, a progress bar on a terminal, plain lines elsewhere.
+//!
+//! Steps of TensorBoard count on from stage to stage and attempt to attempt ([`Position::total`]): its readers understand a step that falls as
+//! a restart, and drop every curve from there on.
 
 use super::{
     resume::{Position, Stage},
     tensorboard::EventWriter,
 };
 use anyhow::{Context, Result};
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{FormattedDuration, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 use serde_json::{Map, Value, json};
 use std::{
+    fmt,
     fs::{self, File, OpenOptions},
-    io::Write,
+    io::{self, Write},
     path::Path,
+    time::Duration,
 };
+
+/// Off a terminal, a line at least this often, seconds.
+const QUIET_MAX: f64 = 30.0;
 
 /// The wall clock, seconds since 1970; given by the binary, since training itself depends on no clock.
 pub type Clock = dyn Fn() -> f64 + Send;
@@ -19,11 +27,53 @@ pub type Clock = dyn Fn() -> f64 + Send;
 /// The log of one run.
 pub struct Log {
     lines: File,
+    /// The last line before this process.
+    last: String,
     events: EventWriter,
     bar: ProgressBar,
     clock: Box<Clock>,
+    pace: Pace,
     sums: Vec<(&'static str, f64)>,
     count: usize,
+}
+
+/// How fast a stage goes.
+#[derive(Default)]
+struct Pace {
+    /// Steps of the stage.
+    steps: usize,
+    /// Where this process began with it: step and time.
+    from: (usize, f64),
+    /// Time of the last line.
+    said: f64,
+}
+
+impl Pace {
+    /// `stage2 step 300 of 3000, 41.2 steps/s, 00:01:05 left`
+    fn text(&self, position: &Position, now: f64) -> String {
+        let (step, steps, elapsed) = (position.step, self.steps, now - self.from.1);
+        let mut text = format!("{} step {step} of {steps}", position.stage.name());
+        let rate = step.saturating_sub(self.from.0) as f64 / elapsed;
+        if let Some(left) = Duration::try_from_secs_f64(steps.saturating_sub(step) as f64 / rate).ok().filter(|_| rate.is_finite()) {
+            text += &format!(", {}, {} left", rate_text(rate), FormattedDuration(left));
+        }
+        text
+    }
+}
+
+/// Steps per second, or where they are slower the seconds that one takes.
+fn rate_text(rate: f64) -> String {
+    match rate {
+        100.0.. => format!("{rate:.0} steps/s"),
+        1.0.. => format!("{rate:.1} steps/s"),
+        _ if rate > 0.0 => format!("{:.1} s/step", 1.0 / rate),
+        _ => "-".into(),
+    }
+}
+
+/// A line for the reader. Where nobody is there to read it any more (a terminal that hung up), training goes on.
+fn tell(text: &str) {
+    let _nobody_reads = writeln!(io::stderr(), "{text}");
 }
 
 impl Log {
@@ -40,23 +90,30 @@ impl Log {
             Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
         };
         let kept: String = text.lines().filter(|line| is_before(line, position)).flat_map(|line| [line, "\n"]).collect();
-        fs::write(&path, kept).with_context(|| format!("cannot write {}", path.display()))?;
+        fs::write(&path, &kept).with_context(|| format!("cannot write {}", path.display()))?;
+        let last = kept.lines().next_back().unwrap_or_default().to_owned();
         let lines = OpenOptions::new().append(true).open(&path)?;
-        let events = EventWriter::create(dir, position.step as u64, clock())?;
+        let events = EventWriter::create(dir, position.total() as u64, clock())?;
         let bar = ProgressBar::with_draw_target(Some(0), ProgressDrawTarget::stderr());
-        let template = "{prefix} {wide_bar} {pos}/{len}  {msg}  {per_sec}, {eta} left";
-        bar.set_style(ProgressStyle::with_template(template).expect("the template is constant: is a bug"));
-        Ok(Self { lines, events, bar, clock, sums: Vec::new(), count: 0 })
+        let template = "{prefix} {wide_bar} {pos}/{len}  {msg}  {rate}, {eta_precise} left";
+        let style = ProgressStyle::with_template(template).expect("the template is constant: is a bug");
+        // What cannot be written on a terminal has no reader.
+        bar.set_style(style.with_key("rate", |state: &ProgressState, out: &mut dyn fmt::Write| {
+            let _nobody_reads = out.write_str(&rate_text(state.per_sec()));
+        }));
+        Ok(Self { lines, last, events, bar, clock, pace: Pace::default(), sums: Vec::new(), count: 0 })
     }
 
     /// A stage begins at `position` and has `steps` steps.
-    pub fn begin(&self, position: &Position, steps: usize) {
+    pub fn begin(&mut self, position: &Position, steps: usize) {
+        let now = (self.clock)();
+        self.pace = Pace { steps, from: (position.step, now), said: now };
         self.bar.set_length(steps as u64);
         self.bar.set_position(position.step as u64);
         self.bar.reset_eta();
         self.bar.set_prefix(position.stage.name());
         if self.bar.is_hidden() {
-            eprintln!("{}: step {} of {steps}", position.stage.name(), position.step);
+            tell(&self.pace.text(position, now));
         }
     }
 
@@ -66,6 +123,11 @@ impl Log {
     /// If a file cannot be written.
     pub fn step(&mut self, position: &Position, every: usize, scalars: &[(&'static str, f64)]) -> Result<()> {
         self.bar.set_position(position.step as u64);
+        let now = (self.clock)();
+        if self.bar.is_hidden() && now - self.pace.said >= QUIET_MAX && !position.step.is_multiple_of(every) {
+            self.pace.said = now;
+            tell(&self.pace.text(position, now));
+        }
         if self.sums.len() != scalars.len() {
             self.sums = scalars.iter().map(|(name, _)| (*name, 0.0)).collect();
             self.count = 0;
@@ -92,13 +154,20 @@ impl Log {
             ("step".to_string(), json!(position.step)),
         ]);
         line.extend(scalars.iter().map(|(name, value)| (name.to_string(), json!(value))));
-        writeln!(self.lines, "{}", Value::Object(line))?;
+        let line = Value::Object(line).to_string();
+        if line == self.last {
+            // A measurement after the last step before a kill; it is on disk already.
+            return Ok(());
+        }
+        writeln!(self.lines, "{line}")?;
         let prefix = if position.attempt == 0 { stage.to_string() } else { format!("{stage}.attempt{}", position.attempt) };
         let tags: Vec<(String, f64)> = scalars.iter().map(|(name, value)| (format!("{prefix}/{name}"), *value)).collect();
-        self.events.scalars(position.step as u64, (self.clock)(), tags.iter().map(|(tag, value)| (tag.as_str(), *value)))?;
+        let now = (self.clock)();
+        self.events.scalars(position.total() as u64, now, tags.iter().map(|(tag, value)| (tag.as_str(), *value)))?;
         let text: Vec<String> = scalars.iter().map(|(name, value)| format!("{name} {value:.4}")).collect();
         if self.bar.is_hidden() {
-            eprintln!("{stage} {:>6}  {}", position.step, text.join("  "));
+            self.pace.said = now;
+            tell(&format!("{}: {}", self.pace.text(position, now), text.join("  ")));
         } else {
             self.bar.set_message(text.first().cloned().unwrap_or_default());
         }
@@ -107,7 +176,7 @@ impl Log {
 
     /// A sentence for the reader.
     pub fn say(&self, text: &str) {
-        self.bar.suspend(|| eprintln!("{text}"));
+        self.bar.suspend(|| tell(text));
     }
 }
 
@@ -126,10 +195,21 @@ fn is_before(line: &str, position: &Position) -> bool {
 mod tests {
     use super::*;
 
+    /// A run of hours into a file was silent, or told a step without total, rate or end; the bar said `1.2345e-3/s`.
+    #[test]
+    fn progress_has_total_rate_and_time_left() {
+        let pace = Pace { steps: 3000, from: (100, 50.0), said: 50.0 };
+        let text = |step, now| pace.text(&Position { stage: Stage::Refine, attempt: 0, step, before: 0 }, now);
+        assert_eq!(text(300, 54.0), "stage2 step 300 of 3000, 50.0 steps/s, 00:00:54 left");
+        assert_eq!(text(100, 50.0), "stage2 step 100 of 3000", "nothing is known yet");
+        assert_eq!(text(101, 850.0), "stage2 step 101 of 3000, 800.0 s/step, 26d 20:13:20 left");
+        assert_eq!([0.0012345, 0.5, 12.34, 432.1].map(rate_text), ["810.0 s/step", "2.0 s/step", "12.3 steps/s", "432 steps/s"]);
+    }
+
     #[test]
     fn a_resumed_log_drops_what_comes_after_the_state() {
         let dir = tempfile::tempdir().unwrap();
-        let at = |stage, step| Position { stage, attempt: 0, step };
+        let at = |stage, step| Position { stage, attempt: 0, step, before: 0 };
         let mut log = Log::open(dir.path(), &at(Stage::Latent, 0), Box::new(|| 0.0)).unwrap();
         for step in 1..=4 {
             log.step(&at(Stage::Latent, step), 2, &[("loss", step as f64)]).unwrap();

@@ -1,10 +1,13 @@
 //! How checkpoints are made: recipe -> data set -> stage 1 -> stage 2 -> checkpoint. Losses live beside the networks they train
 //! (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here the crank is turned.
+pub mod amend;
 pub mod ceiling;
 pub mod dataset;
 pub mod defaults;
 pub mod flags;
 pub mod learner;
+#[cfg(test)]
+mod legal_tests;
 pub mod log;
 pub mod optimizer;
 pub mod parallel;
@@ -20,7 +23,7 @@ pub mod tensorboard;
 #[cfg(test)]
 mod tests;
 
-use crate::model::{config::ModelConfig, diffusion::refine::LatentRouting};
+use crate::model::{checkpoint::is_name, config::ModelConfig};
 use anyhow::{Context, Result, bail, ensure};
 use dataset::{
     Split, UnitsFrom, hdf5,
@@ -30,7 +33,8 @@ use dataset::{
 use learner::{Learner, Scalars};
 use log::{Clock, Log};
 use recipe::{Gate, Recipe};
-use resume::{Identity, Stage, Store};
+use resume::{Stage, Store};
+use ship::Product;
 use stage1::ElboTask;
 use stage2::RefineTask;
 use std::{
@@ -51,6 +55,8 @@ pub struct Options {
     pub out: PathBuf,
     /// Stop after this many steps of this process, as if interrupted.
     pub stop_after_steps: Option<usize>,
+    /// Keep the checkpoint of the least held-out loss of stage 2 as well, in a directory beside `out`: its name with `-best`.
+    pub keep_best: bool,
     /// Set by the binary when the user interrupts: the run saves its state and ends after the step in progress.
     pub stop: Arc<AtomicBool>,
     /// Rows of the data set that take more than this are kept in a file beside the training state; none: half of the memory that is free.
@@ -99,26 +105,23 @@ impl Task {
         let (layout, notes, dataset_digest) = (dataset.layout(), std::mem::take(&mut dataset.notes), dataset.digest.clone());
         let (split, action_columns) = dataset.split(UnitsFrom::Data(&recipe.actions))?;
         let config = ModelConfig {
-            layout,
-            plan_horizon: recipe.model.plan_horizon,
-            block_len: recipe.model.block_len,
-            obs_horizon: recipe.model.obs_horizon,
-            level_max: recipe.model.level_max,
-            latent: recipe.model.latent.clone(),
-            denoiser: recipe.model.denoiser.clone(),
-            state_clip: recipe.model.state_clip,
             action_low: split.units.action_low.clone(),
             action_high: split.units.action_high.clone(),
             normalizer: split.units.normalizer.clone(),
-            sub_steps_trained: vec![recipe.sampler.sub_steps],
-            action_horizons_trained: recipe.action_horizons(),
-            missing_trained: recipe.hide.trained(),
-            refined: recipe.model.latent.is_some() && recipe.stage2.routing == LatentRouting::Matched,
-            latent_spread: 0.0,
-            restart: recipe.restart,
-            sampler: recipe.sampler.clone(),
+            ..recipe.config(layout)
         };
-        Ok(Self { recipe, split, action_columns, dataset_digest, config, notes })
+        // The recipe was checked with plain units; now the data's are known.
+        config.check().with_context(|| format!("data set {} makes no model", recipe.data.display()))?;
+        let task = Self { recipe, split, action_columns, dataset_digest, config, notes };
+        if task.recipe.gate.is_some() {
+            ensure!(
+                stage1::contexts_vary(&task)?,
+                "recipe: `gate`: in the held-out episodes of {} `infos/context` never changes, so an error in units of its variance is no \
+                 number; record episodes with other contexts, or leave [gate] out",
+                task.recipe.data.display()
+            );
+        }
+        Ok(task)
     }
 }
 
@@ -130,7 +133,7 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     let dir = options.out.join(TRAINING_DIR);
     let task = Task::new(recipe, &Room::new(options.data_memory_mib, dir.clone()))?;
     let _alone = lock(&dir)?;
-    let store = Store::new(&dir, Identity { recipe: task.recipe.to_toml(), dataset: task.dataset_digest.clone() });
+    let store = Store::new(&dir, &task.recipe, &task.dataset_digest);
     let state = store.load()?;
     let resumed = state.as_ref().map(|state| state.position);
     let mut learner = match state {
@@ -145,11 +148,33 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     for (index, notable) in task.action_columns.iter().map(ActionColumn::notable).enumerate() {
         notable.into_iter().for_each(|notable| log.say(&format!("warning: actions, column {index}: {notable}")));
     }
+    log.say(&format!("log: {}; curves: tensorboard --logdir {}", dir.join("log.jsonl").display(), options.out.display()));
+    let named = |dir: &Path| dir.file_name().and_then(|name| name.to_str()).is_some_and(is_name);
+    for dir in [Some(&options.out), options.keep_best.then(|| best_dir(&options.out)).as_ref()].into_iter().flatten() {
+        if !named(dir) {
+            log.say(&format!("{}: the server will not serve a directory of this name (1 to 64 of A-Z a-z 0-9 _ . -)", dir.display()));
+        }
+    }
     if let Some(position) = resumed {
         log.say(&format!("going on at {} step {}", position.stage.name(), position.step));
+        learner.notes.changes.iter().for_each(|change| log.say(&change.to_string()));
     }
-    let mut crank = Crank { task: &task, store, log, out: &options.out, stop: options.stop, steps_left: options.stop_after_steps };
+    let best = options.keep_best.then(|| best_dir(&options.out));
+    let out = &options.out;
+    let mut crank = Crank { task: &task, store, log, out, best, finished: None, stop: options.stop, steps_left: options.stop_after_steps };
     crank.run(&mut learner)
+}
+
+/// Beside the run, so that a server over the directory of both serves both.
+fn best_dir(out: &Path) -> PathBuf {
+    match out.file_name() {
+        Some(name) => {
+            let mut name = name.to_os_string();
+            name.push("-best");
+            out.with_file_name(name)
+        }
+        None => out.join("best"),
+    }
 }
 
 /// Holds the directory for this process, as long as the file is open.
@@ -166,6 +191,10 @@ struct Crank<'a> {
     store: Store,
     log: Log,
     out: &'a Path,
+    /// Where the best checkpoint goes, if it is kept.
+    best: Option<PathBuf>,
+    /// The checkpoint of the last step, if this process wrote it.
+    finished: Option<Product>,
     stop: Arc<AtomicBool>,
     steps_left: Option<usize>,
 }
@@ -177,8 +206,11 @@ impl Crank<'_> {
                 Stage::Latent => self.stage1(learner)?,
                 Stage::Refine => self.stage2(learner)?,
                 Stage::Done => {
-                    let metrics = ship::ship(self.task, learner, self.out)?;
-                    self.log.say(&format!("checkpoint in {}: {metrics:#}", self.out.display()));
+                    let product = match self.finished.take() {
+                        Some(product) => product,
+                        None => self.ship(learner)?,
+                    };
+                    self.log.say(&format!("checkpoint in {}: {:#}", self.out.display(), product.metrics()));
                     return Ok(Outcome::Finished);
                 }
             };
@@ -198,13 +230,17 @@ impl Crank<'_> {
         let (Some(elbo), Some(stage)) = (ElboTask::new(task), &task.recipe.stage1) else {
             bail!("stage 1 of a recipe without latents: is a bug");
         };
-        if self.turn(learner, stage.steps, |learner| elbo.step(learner))? == Outcome::Stopped {
+        let mut measure = |crank: &mut Self, learner: &mut Learner| match elbo.held_out_loss(&learner.networks)? {
+            Some(loss) => crank.log.write(&learner.position, &[("held_out_elbo", loss)]),
+            None => Ok(()),
+        };
+        if self.turn(learner, stage.steps, |learner| elbo.step(learner), &mut measure)? == Outcome::Stopped {
             return Ok(Outcome::Stopped);
         }
         if !self.passes_gate(learner)? {
-            let attempt = learner.position.attempt + 1;
-            let probes = std::mem::take(&mut learner.probes);
-            *learner = Learner { probes, ..Learner::fresh(task, attempt)? };
+            let position = learner.position.then(Stage::Latent, learner.position.attempt + 1);
+            let notes = std::mem::take(&mut learner.notes);
+            *learner = Learner { notes, position, ..Learner::fresh(task, position.attempt)? };
         } else {
             learner.enter(task, Stage::Refine)?;
         }
@@ -218,12 +254,10 @@ impl Crank<'_> {
         let Some(latent) = learner.networks.latent.as_ref().filter(|_| task.split.train[0].context_dim > 0) else { return Ok(true) };
         let result = stage1::gate(task, latent)?;
         self.log.write(&learner.position, &[("probe_filter", result.filter), ("probe_successor_state", result.successor_state)])?;
-        if let Some(probes) = learner.probes.as_array_mut() {
-            probes.push(serde_json::to_value(result)?);
-        }
+        learner.notes.probes.push(serde_json::to_value(result)?);
         let Some(gate) = &task.recipe.gate else { return Ok(true) };
         if !result.passes(gate) && learner.position.attempt + 1 >= gate.tries {
-            return Err(gate_failure(gate, &learner.probes));
+            return Err(gate_failure(gate, &learner.notes.probes.clone().into()));
         }
         if !result.passes(gate) {
             self.log.say("the probe is above the gate: stage 1 starts anew from another seed");
@@ -233,7 +267,11 @@ impl Crank<'_> {
 
     fn stage2(&mut self, learner: &mut Learner) -> Result<Outcome> {
         let refine = RefineTask::new(self.task);
-        let outcome = self.turn(learner, self.task.recipe.stage2.steps, |learner| refine.step(learner))?;
+        let mut ship = |crank: &mut Self, learner: &mut Learner| {
+            crank.finished = Some(crank.ship(learner)?);
+            Ok(())
+        };
+        let outcome = self.turn(learner, self.task.recipe.stage2.steps, |learner| refine.step(learner), &mut ship)?;
         if outcome == Outcome::Finished {
             learner.position.stage = Stage::Done;
             self.store.save(&learner.snapshot())?;
@@ -241,8 +279,15 @@ impl Crank<'_> {
         Ok(outcome)
     }
 
-    /// Steps until the stage has `steps`; the one loop of training.
-    fn turn(&mut self, learner: &mut Learner, steps: usize, mut step: impl FnMut(&mut Learner) -> Result<Scalars>) -> Result<Outcome> {
+    /// Steps until the stage has `steps`; the one loop of training. At every checkpoint and at the end `measure` is asked, before the
+    /// state is saved: what it logs is then neither lost nor told twice by a run that is killed in between.
+    fn turn(
+        &mut self,
+        learner: &mut Learner,
+        steps: usize,
+        mut step: impl FnMut(&mut Learner) -> Result<Scalars>,
+        measure: &mut dyn FnMut(&mut Self, &mut Learner) -> Result<()>,
+    ) -> Result<Outcome> {
         let recipe = &self.task.recipe;
         self.log.begin(&learner.position, steps);
         while learner.position.step < steps {
@@ -257,20 +302,27 @@ impl Crank<'_> {
             }
             learner.position.step += 1;
             self.log.step(&learner.position, recipe.log_every, &scalars)?;
-            if learner.position.step.is_multiple_of(recipe.checkpoint_every) {
-                self.checkpoint(learner)?;
+            if learner.position.step.is_multiple_of(recipe.checkpoint_every) || learner.position.step == steps {
+                measure(self, learner)?;
+                self.store.save(&learner.snapshot())?;
             }
         }
         Ok(Outcome::Finished)
     }
 
-    /// The training state, and in stage 2 a checkpoint that can already be served.
-    fn checkpoint(&self, learner: &Learner) -> Result<()> {
-        self.store.save(&learner.snapshot())?;
+    /// Writes a checkpoint that can be served, and again beside it if it is the best so far.
+    fn ship(&mut self, learner: &mut Learner) -> Result<Product> {
+        let product = ship::product(self.task, learner)?;
+        product.save(self.out)?;
+        let loss = product.held_out_loss;
         if learner.position.stage == Stage::Refine {
-            ship::ship(self.task, learner, self.out)?;
+            self.log.write(&learner.position, &[("held_out_loss", loss)])?;
         }
-        Ok(())
+        if let Some(best) = self.best.as_ref().filter(|_| learner.notes.best.is_none_or(|least| loss < least)) {
+            product.save(best)?;
+            learner.notes.best = Some(loss);
+        }
+        Ok(product)
     }
 
     fn should_stop(&mut self) -> bool {

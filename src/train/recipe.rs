@@ -5,24 +5,38 @@ use super::{
     optimizer::LearningRate,
 };
 use crate::model::{
-    agent::SamplerOptions, config::Restart, denoiser::DenoiserConfig, diffusion::refine::LatentRouting, latent::LatentConfig,
+    agent::SamplerOptions,
+    checkpoint::{NAME_LEN_MAX, is_name},
+    config::{ModelConfig, Restart},
+    denoiser::DenoiserConfig,
+    diffusion::refine::LatentRouting,
+    latent::LatentConfig,
+    trajectory::Layout,
 };
 use serde::{Deserialize, Serialize};
 use std::{
     collections::BTreeSet,
+    ops::RangeInclusive,
     path::{Path, PathBuf},
 };
+
+/// Rows of one batch.
+const BATCH_MAX: usize = 65_536;
+/// Steps of a block of stage 1.
+const LENGTH_MAX: usize = 65_536;
+/// Weights of losses and of decay; beyond, a loss is no number any more.
+const WEIGHTS: RangeInclusive<f64> = 0.0..=1e9;
 
 /// Why a recipe was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum RecipeError {
     /// The file could not be read.
-    #[error("recipe {path}: {source}")]
+    #[error("recipe {path}: {reason}")]
     Io {
         /// The file.
         path: PathBuf,
         /// What the system said.
-        source: std::io::Error,
+        reason: String,
     },
     /// Not TOML, a key that does not exist, a missing key, or a value of another type.
     #[error("recipe {path}: {reason}")]
@@ -188,33 +202,47 @@ pub struct Stage2 {
 }
 
 impl Recipe {
-    /// Reads a recipe, applies overrides (`stage2.steps=100`) and checks it.
+    /// Reads a recipe, applies overrides (`stage2.steps=100`) and the path of another data set, and checks it.
     ///
     /// # Errors
     /// If the file cannot be read, or a key is unknown, missing, or its value makes no sense.
-    pub fn read(path: &Path, overrides: &[String]) -> Result<Self, RecipeError> {
-        let text = std::fs::read_to_string(path).map_err(|source| RecipeError::Io { path: path.into(), source })?;
-        let syntax = |reason: String| RecipeError::Syntax { path: path.into(), reason };
-        let recipe: Self = if overrides.is_empty() {
-            toml::from_str(&text).map_err(|error| syntax(error.to_string()))?
+    pub fn read(path: &Path, overrides: &[String], data: Option<&Path>) -> Result<Self, RecipeError> {
+        let text = std::fs::read_to_string(path).map_err(|error| RecipeError::Io { path: path.into(), reason: error.to_string() })?;
+        let syntax = |error: toml::de::Error| RecipeError::Syntax { path: path.into(), reason: error.to_string() };
+        let mut recipe: Self = if overrides.is_empty() && data.is_none() {
+            toml::from_str(&text).map_err(syntax)?
         } else {
-            let mut table: toml::Table = toml::from_str(&text).map_err(|error| syntax(error.to_string()))?;
-            for text in overrides {
-                set(&mut table, text)?;
+            let mut table: toml::Table = toml::from_str(&text).map_err(syntax)?;
+            overrides.iter().try_for_each(|text| set(&mut table, text))?;
+            if data.is_some() {
+                // The path itself is set below: not every path can be a TOML string. The key need not be in the file.
+                table.insert("data".into(), toml::Value::String(String::new()));
             }
-            table.try_into().map_err(|error: toml::de::Error| syntax(error.to_string()))?
+            table.try_into().map_err(syntax)?
         };
+        if let Some(data) = data {
+            recipe.data = data.into();
+        }
         recipe.check()?;
         Ok(recipe)
     }
 
-    /// The recipe as TOML, as it goes into the manifest: overrides included, of the data set's path only the name.
+    /// The recipe as TOML, as it goes into the manifest: overrides included, of the data set's path only the name (where it is not Unicode,
+    /// what can be shown of it).
     pub fn to_toml(&self) -> String {
-        let data = self.data.file_name().map_or_else(|| self.data.clone(), PathBuf::from);
+        let data = self.data.file_name().unwrap_or(self.data.as_os_str()).to_string_lossy().into_owned().into();
         let mut table = toml::Table::try_from(Self { data, ..self.clone() }).expect("a recipe came from TOML: is a bug");
-        if let (true, Some(sampler)) = (self.sampler.kappa.is_infinite(), table.get_mut("sampler").and_then(toml::Value::as_table_mut)) {
-            // Infinity is serialised as null, which JSON needs and TOML leaves out.
-            sampler.insert("kappa".into(), toml::Value::Float(f64::INFINITY));
+        // Infinity is serialised as null, which JSON needs and TOML leaves out.
+        let Restart { renoise_distance, cold_distance, latent_jump } = self.restart;
+        for (section, key, value) in [
+            ("sampler", "kappa", self.sampler.kappa),
+            ("restart", "renoise_distance", renoise_distance),
+            ("restart", "cold_distance", cold_distance),
+            ("restart", "latent_jump", latent_jump),
+        ] {
+            if let (true, Some(section)) = (value.is_infinite(), table.get_mut(section).and_then(toml::Value::as_table_mut)) {
+                section.insert(key.into(), toml::Value::Float(f64::INFINITY));
+            }
         }
         toml::to_string(&table).expect("a table is TOML: is a bug")
     }
@@ -225,6 +253,25 @@ impl Recipe {
         all.into_iter().collect()
     }
 
+    /// What this recipe ships, with plain units in place of what only data and training tell.
+    pub fn config(&self, layout: Layout) -> ModelConfig {
+        let model = &self.model;
+        ModelConfig {
+            plan_horizon: model.plan_horizon,
+            block_len: model.block_len,
+            obs_horizon: model.obs_horizon,
+            level_max: model.level_max,
+            state_clip: model.state_clip,
+            sub_steps_trained: vec![self.sampler.sub_steps],
+            action_horizons_trained: self.action_horizons(),
+            missing_trained: self.hide.trained(),
+            refined: model.latent.is_some() && self.stage2.routing == LatentRouting::Matched,
+            restart: self.restart,
+            sampler: self.sampler.clone(),
+            ..ModelConfig::plain(layout, model.latent.clone(), model.denoiser.clone())
+        }
+    }
+
     /// Steps an episode must have, and the keys that ask for them.
     pub fn episode_len_min(&self) -> (usize, String) {
         let window = (self.model.plan_horizon, "`model.plan_horizon`".to_string());
@@ -232,32 +279,18 @@ impl Recipe {
         block.into_iter().fold(window, |most, other| if other.0 > most.0 { other } else { most })
     }
 
+    /// What is shipped must be a model that loads ([`ModelConfig::check`]); the rest is training's own.
     fn check(&self) -> Result<(), RecipeError> {
-        let model = &self.model;
-        require(!self.name.is_empty(), "name", "must not be empty")?;
-        require(model.plan_horizon >= 2, "model.plan_horizon", "must be at least 2")?;
-        require(model.block_len >= 1, "model.block_len", "must be at least 1")?;
-        require(model.obs_horizon >= 1, "model.obs_horizon", "must be at least 1 (the current state)")?;
-        let rows = self.sampler.sub_steps * model.plan_horizon;
-        require(model.level_max >= rows, "model.level_max", format!("must be at least sampler.sub_steps * model.plan_horizon = {rows}"))?;
-        require(model.state_clip > 0.0, "model.state_clip", "must be positive")?;
-        require(self.sampler.sub_steps >= 1, "sampler.sub_steps", "must be at least 1")?;
-        let within = (1..=model.plan_horizon).contains(&self.sampler.action_horizon);
-        require(within, "sampler.action_horizon", format!("must lie in 1..={} (model.plan_horizon)", model.plan_horizon))?;
-        require(self.sampler.temperature >= 0.0, "sampler.temperature", "must not be negative")?;
-        require(self.sampler.kappa >= 0.0, "sampler.kappa", "must not be negative")?;
+        self.config(Layout { state_dim: 1, action_dim: 1 }).check().map_err(|unfit| {
+            let own = unfit.field.starts_with("sampler.") || unfit.field.starts_with("restart.");
+            RecipeError::Invalid { key: if own { unfit.field } else { format!("model.{}", unfit.field) }, reason: unfit.reason }
+        })?;
+        let room = NAME_LEN_MAX.saturating_sub(format!("-seed{}", self.seed).len());
+        let named = is_name(&self.name) && self.name.len() <= room;
+        require(named, "name", format!("{:?} must be 1 to {room} of A-Z a-z 0-9 _ . -, as the server serves it by this name", self.name))?;
+        require(self.model.plan_horizon >= 2, "model.plan_horizon", "must be at least 2")?;
         for (key, value) in [("checkpoint_every", self.checkpoint_every), ("log_every", self.log_every)] {
             require(value >= 1, key, "must be at least 1")?;
-        }
-        match &self.model.denoiser {
-            DenoiserConfig::Unet { widths } => {
-                let factor = 1 << widths.len().saturating_sub(1);
-                let divides = !widths.is_empty() && model.plan_horizon.is_multiple_of(factor);
-                require(divides, "model.denoiser.widths", format!("model.plan_horizon must be divisible by 2^(widths - 1) = {factor}"))?;
-            }
-            DenoiserConfig::Dit { width, heads, .. } => {
-                require(*heads >= 1 && width.is_multiple_of(*heads), "model.denoiser.heads", "must divide model.denoiser.width")?;
-            }
         }
         for (key, share) in [("hide.state", self.hide.state), ("hide.action", self.hide.action), ("hide.reward", self.hide.reward)] {
             require((0.0..=1.0).contains(&share), key, "must lie in 0..=1")?;
@@ -267,52 +300,58 @@ impl Recipe {
     }
 
     fn check_stage1(&self) -> Result<(), RecipeError> {
-        match (&self.model.latent, &self.stage1) {
-            (Some(latent), Some(stage)) => {
-                require(latent.dim >= 1 && latent.hidden >= 1, "model.latent", "dim and hidden must be at least 1")?;
-                require(stage.batch >= 1, "stage1.batch", "must be at least 1")?;
-                require(stage.length >= 2, "stage1.length", "must be at least 2")?;
-                require((0.0..=1.0).contains(&stage.show_action), "stage1.show_action", "must lie in 0..=1")?;
-                require((0.0..=1.0).contains(&stage.show_reward), "stage1.show_reward", "must lie in 0..=1")?;
-                require(stage.kl_weight.start >= 0.0 && stage.kl_weight.end >= 0.0, "stage1.kl_weight", "must not be negative")?;
-                check_rate("stage1.learning_rate", &stage.learning_rate)?;
-                require(self.gate.is_none_or(|gate| gate.tries >= 1), "gate.tries", "must be at least 1")
-            }
-            (None, None) => require(self.gate.is_none(), "gate", "needs model.latent"),
-            (Some(_), None) => require(false, "stage1", "is missing, but model.latent asks for it"),
-            (None, Some(_)) => require(false, "stage1", "needs model.latent"),
+        let stage = match (&self.model.latent, &self.stage1) {
+            (Some(_), Some(stage)) => stage,
+            (None, None) => return require(self.gate.is_none(), "gate", "needs model.latent"),
+            (Some(_), None) => return require(false, "stage1", "is missing, but model.latent asks for it"),
+            (None, Some(_)) => return require(false, "stage1", "needs model.latent"),
+        };
+        between("stage1.batch", stage.batch, 1..=BATCH_MAX)?;
+        between("stage1.length", stage.length, 2..=LENGTH_MAX)?;
+        between("stage1.show_action", stage.show_action, 0.0..=1.0)?;
+        between("stage1.show_reward", stage.show_reward, 0.0..=1.0)?;
+        between("stage1.kl_weight.start", stage.kl_weight.start, WEIGHTS)?;
+        between("stage1.kl_weight.end", stage.kl_weight.end, WEIGHTS)?;
+        between("stage1.reward_weight", stage.reward_weight, WEIGHTS)?;
+        between("stage1.weight_decay", stage.weight_decay, WEIGHTS)?;
+        check_rate("stage1.learning_rate", &stage.learning_rate)?;
+        let Some(gate) = &self.gate else { return Ok(()) };
+        for (key, value) in [("gate.filter", gate.filter), ("gate.successor_state", gate.successor_state)] {
+            require(value >= 0.0, key, format!("is {value}, must be 0 or above"))?;
         }
+        require(gate.tries >= 1, "gate.tries", "must be at least 1")
     }
 
     fn check_stage2(&self) -> Result<(), RecipeError> {
         let stage = &self.stage2;
-        require(stage.batch >= 1, "stage2.batch", "must be at least 1")?;
-        require((0.0..=1.0).contains(&stage.ready_fraction), "stage2.ready_fraction", "must lie in 0..=1")?;
+        between("stage2.batch", stage.batch, 1..=BATCH_MAX)?;
+        between("stage2.ready_fraction", stage.ready_fraction, 0.0..=1.0)?;
         require((0.0..1.0).contains(&stage.ema_decay_max), "stage2.ema_decay_max", "must lie in 0..1")?;
-        require(stage.first_action_weight > 0.0, "stage2.first_action_weight", "must be positive")?;
-        require(stage.elbo_weight >= 0.0, "stage2.elbo_weight", "must not be negative")?;
+        let weight = stage.first_action_weight;
+        require(weight.is_finite() && weight > 0.0, "stage2.first_action_weight", format!("is {weight}, must be positive and finite"))?;
+        between("stage2.elbo_weight", stage.elbo_weight, WEIGHTS)?;
         require(stage.elbo_weight == 0.0 || self.stage1.is_some(), "stage2.elbo_weight", "must be 0 without stage1")?;
-        require(stage.latent_lr_factor >= 0.0, "stage2.latent_lr_factor", "must not be negative")?;
+        between("stage2.latent_lr_factor", stage.latent_lr_factor, WEIGHTS)?;
+        between("stage2.weight_decay", stage.weight_decay, WEIGHTS)?;
         let within = stage.action_horizons.iter().all(|horizon| (1..=self.model.plan_horizon).contains(horizon));
         require(within, "stage2.action_horizons", format!("must lie in 1..={} (model.plan_horizon)", self.model.plan_horizon))?;
         let gaps = self.action_horizons().iter().all(|horizon| *horizon == 1) || self.hide.state > 0.0;
         require(gaps, "hide.state", "must be above 0 where a chunk has several actions: its client may know no states in between")?;
-        let unrefined = self.model.latent.is_some() && stage.routing != LatentRouting::Matched;
-        let kappa = "must be 0: only stage2.routing = \"matched\" trains the refinement that it lets in";
-        require(!unrefined || self.sampler.kappa == 0.0, "sampler.kappa", kappa)?;
-        require((0.0..=1.0).contains(&self.sampler.eta), "sampler.eta", "must lie in 0..=1")?;
-        require((0.0..=10.0).contains(&self.sampler.temperature), "sampler.temperature", "must lie in 0..=10")?;
         check_rate("stage2.learning_rate", &stage.learning_rate)
     }
 }
 
 fn check_rate(key: &str, rate: &LearningRate) -> Result<(), RecipeError> {
-    require(rate.peak.is_finite() && rate.peak > 0.0, format!("{key}.peak"), "must be positive")?;
+    require(rate.peak.is_finite() && rate.peak > 0.0, format!("{key}.peak"), "must be positive and finite")?;
     require(rate.end >= 0.0 && rate.end <= rate.peak, format!("{key}.end"), "must lie between 0 and the peak")
 }
 
 fn require(holds: bool, key: impl Into<String>, reason: impl Into<String>) -> Result<(), RecipeError> {
     if holds { Ok(()) } else { Err(RecipeError::Invalid { key: key.into(), reason: reason.into() }) }
+}
+
+fn between<T: PartialOrd + std::fmt::Display>(key: &str, value: T, range: RangeInclusive<T>) -> Result<(), RecipeError> {
+    require(range.contains(&value), key, format!("is {value}, must lie in {}..={}", range.start(), range.end()))
 }
 
 /// Sets `a.b.c=value` in a table; the value is read as TOML, else taken as a string.

@@ -5,7 +5,7 @@ use super::{
     dataset::{UnitsFrom, hdf5, room::Room},
     probe::{Evidence, Score, Subjects, latent_probe},
 };
-use crate::model::checkpoint;
+use crate::model::{checkpoint, nn::plain};
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -87,21 +87,46 @@ pub fn inspect(dir: &Path) -> Result<Value> {
     }))
 }
 
-/// [`inspect`] for people.
+/// Fields of the configuration that are told in other words, or are too long to tell.
+const NOT_TOLD: [&str; 4] = ["normalizer", "refined", "sub_steps_trained", "sampler"];
+
+/// [`inspect`] for people: first what is in force when the checkpoint is served, last the recipe that it was trained with.
 pub fn inspect_text(value: &Value) -> String {
     let (config, provenance) = (&value["config"], &value["provenance"]);
-    let mut text = format!("digest      {}\n", value["digest"].as_str().unwrap_or_default());
-    let pair = |name: &str, value: &Value| format!("{name:<11} {value}\n");
-    for key in
-        ["layout", "plan_horizon", "block_len", "obs_horizon", "level_max", "latent", "denoiser", "refined", "latent_spread", "sampler"]
-    {
-        text += &pair(key, &config[key]);
+    let pair = |name: &str, value: &Value| format!("{name:<11} {}\n", told(value));
+    let mut text = pair("digest", &value["digest"]) + &pair("sampler", &config["sampler"]);
+    for (key, value) in config.as_object().into_iter().flatten().filter(|(key, _)| !NOT_TOLD.contains(&key.as_str())) {
+        text += &if key == "latent" && value.is_null() { pair(key, &"none".into()) } else { pair(key, value) };
     }
+    let mut sub_steps: Vec<&Value> = config["sub_steps_trained"].as_array().into_iter().flatten().collect();
+    sub_steps.insert(0, &config["sampler"]["sub_steps"]);
+    sub_steps.dedup();
+    text += &pair("trained for", &json!({"sub_steps": sub_steps, "refinement (kappa above 0)": config["refined"]}));
     text += &pair("parameters", &value["parameters"]);
-    for key in ["dataset", "dataset_sha256", "seed", "metrics"] {
+    for key in ["dataset", "dataset_sha256", "seed"] {
         text += &pair(key, &provenance[key]);
     }
-    text + "recipe\n" + &indent(provenance["recipe"].as_str().unwrap_or_default())
+    text += &format!("metrics     {}\n", provenance["metrics"]);
+    let note = "recipe (as it was trained; sampler and restart above are in force, a session may choose another sampler)\n";
+    text + note + &indent(provenance["recipe"].as_str().unwrap_or_default())
+}
+
+/// Words and numbers without JSON's marks; null is what stands for infinity there.
+fn told(value: &Value) -> String {
+    let list = |values: &mut dyn Iterator<Item = String>| values.collect::<Vec<_>>().join(", ");
+    match value {
+        Value::Null => "inf".into(),
+        Value::String(text) => text.clone(),
+        Value::Array(values) => format!("[{}]", list(&mut values.iter().map(told))),
+        Value::Object(fields) => list(&mut fields.iter().map(|(key, value)| format!("{key} {}", told(value)))),
+        Value::Bool(_) | Value::Number(_) => value.to_string(),
+    }
+}
+
+/// An error for people, on one line: each cause once, and without the backtrace that candle adds to its own.
+pub fn message(error: &anyhow::Error) -> String {
+    let words = |cause: &(dyn std::error::Error + 'static)| cause.downcast_ref().map_or_else(|| cause.to_string(), plain);
+    error.chain().map(words).collect::<Vec<_>>().join(": ")
 }
 
 fn indent(text: &str) -> String {

@@ -3,9 +3,13 @@
 //! Batches are a function of (seed, stage, attempt, step), so no generator has a state to keep: variables, Adam's moments, the EMA
 //! and the position are all there is.
 
-use super::optimizer::{Adam, Ema};
+use super::{
+    amend::{Change, amend},
+    optimizer::{Adam, Ema},
+    recipe::Recipe,
+};
 use crate::model::noise::Philox;
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, anyhow, ensure};
 use candle_core::{Device, Tensor, Var};
 use serde::{Deserialize, Serialize};
 use std::{
@@ -54,22 +58,35 @@ pub struct Position {
     pub attempt: usize,
     /// Steps of this stage that are done.
     pub step: usize,
+    /// Steps that were done in earlier stages and attempts.
+    #[serde(default)]
+    pub before: usize,
 }
 
 impl Position {
+    /// All steps of the run so far; never falls, whatever stage 1 is tried again.
+    pub fn total(&self) -> usize {
+        self.before + self.step
+    }
+
+    /// The start of another stage or attempt after this one.
+    pub fn then(&self, stage: Stage, attempt: usize) -> Self {
+        Self { stage, attempt, step: 0, before: self.total() }
+    }
+
     /// The randomness of the step to come: a stream of its own.
     pub fn stream(&self, seed: u64) -> Philox {
         Philox::named(seed, &format!("{}.{}.{}", self.stage.name(), self.attempt, self.step))
     }
 }
 
-/// What a state belongs to; a state of another run is refused.
+/// What a state belongs to.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Identity {
+struct Identity {
     /// The recipe as TOML, overrides included.
-    pub recipe: String,
+    recipe: String,
     /// SHA-256 of the data set.
-    pub dataset: String,
+    dataset: String,
 }
 
 /// What is written beside the tensors.
@@ -78,15 +95,27 @@ struct Header {
     identity: Identity,
     position: Position,
     adam_steps: u64,
-    probes: serde_json::Value,
+    #[serde(default)]
+    notes: Notes,
+}
+
+/// What a run has found out so far.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Notes {
+    /// Results of the gate.
+    pub probes: Vec<serde_json::Value>,
+    /// Keys of the recipe that were changed under way.
+    pub changes: Vec<Change>,
+    /// Least held-out loss of stage 2, where the best checkpoint is kept.
+    pub best: Option<f64>,
 }
 
 /// A state read from disk.
 pub struct State {
     /// How far it is.
     pub position: Position,
-    /// Results of the gate so far.
-    pub probes: serde_json::Value,
+    /// What the run has found out so far.
+    pub notes: Notes,
     /// Steps that the optimizer has counted.
     pub adam_steps: u64,
     /// `var.NAME`, `m.NAME`, `v.NAME`, `ema.NAME`.
@@ -97,8 +126,8 @@ pub struct State {
 pub struct Snapshot<'a> {
     /// How far the run is.
     pub position: Position,
-    /// Results of the gate so far.
-    pub probes: &'a serde_json::Value,
+    /// What the run has found out so far.
+    pub notes: &'a Notes,
     /// All variables.
     pub vars: &'a BTreeMap<String, Var>,
     /// Their optimizer.
@@ -110,16 +139,17 @@ pub struct Snapshot<'a> {
 /// The state of one run in its directory.
 pub struct Store {
     path: PathBuf,
-    identity: Identity,
+    recipe: Recipe,
+    dataset: String,
 }
 
 impl Store {
-    /// The store in `dir`.
-    pub fn new(dir: &Path, identity: Identity) -> Self {
-        Self { path: dir.join(FILE), identity }
+    /// The store in `dir`, of a run of this recipe on the data set of this SHA-256.
+    pub fn new(dir: &Path, recipe: &Recipe, dataset: &str) -> Self {
+        Self { path: dir.join(FILE), recipe: recipe.clone(), dataset: dataset.into() }
     }
 
-    /// The state, if there is one.
+    /// The state, if there is one. The recipe may differ in what [`amend`] allows; the state then knows of it.
     ///
     /// # Errors
     /// If it is of another recipe or data set, or cannot be read.
@@ -134,21 +164,16 @@ impl Store {
         let (_, metadata) = safetensors::SafeTensors::read_metadata(&bytes).with_context(broken)?;
         let text = metadata.metadata().as_ref().and_then(|map| map.get(KEY)).with_context(broken)?;
         let header: Header = serde_json::from_str(text).with_context(broken)?;
-        ensure!(
-            header.identity.dataset == self.identity.dataset,
-            "{path} was made with another data set; remove it to start anew, or choose another --out"
-        );
-        ensure!(
-            header.identity.recipe == self.identity.recipe,
-            "{path} was made with another recipe or seed; remove it to start anew, or choose another --out"
-        );
+        let cure = "remove it to start anew, or choose another --out";
+        let (theirs, ours) = (&header.identity.dataset, &self.dataset);
+        ensure!(theirs == ours, "{path} was made with another data set (SHA-256 {theirs}, now {ours}); {cure}");
+        let mut position = header.position;
+        let changes = amend(&header.identity.recipe, &self.recipe, &mut position)
+            .map_err(|reason| anyhow!("{path} was made with another recipe: {reason}; {cure}"))?;
+        let mut notes = header.notes;
+        notes.changes.extend(changes);
         let tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu).with_context(broken)?;
-        Ok(Some(State {
-            position: header.position,
-            probes: header.probes,
-            adam_steps: header.adam_steps,
-            tensors: tensors.into_iter().collect(),
-        }))
+        Ok(Some(State { position, notes, adam_steps: header.adam_steps, tensors: tensors.into_iter().collect() }))
     }
 
     /// Writes a state beside the old one and renames it: a kill at any moment leaves one of the two.
@@ -162,7 +187,8 @@ impl Store {
         if let Some(ema) = snapshot.ema {
             tensors.extend(ema.tensors(snapshot.vars)?.into_iter().map(|(name, tensor)| (format!("ema.{name}"), tensor)));
         }
-        let header = Header { identity: self.identity.clone(), position: snapshot.position, adam_steps, probes: snapshot.probes.clone() };
+        let identity = Identity { recipe: self.recipe.to_toml(), dataset: self.dataset.clone() };
+        let header = Header { identity, position: snapshot.position, adam_steps, notes: snapshot.notes.clone() };
         let metadata = HashMap::from([(KEY.to_string(), serde_json::to_string(&header)?)]);
         let bytes = safetensors::serialize(&tensors, Some(metadata))?;
         write_beside(&self.path, &bytes).with_context(|| format!("cannot write {}", self.path.display()))

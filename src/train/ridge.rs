@@ -10,6 +10,11 @@ pub struct Table {
 }
 
 impl Table {
+    /// Whether any column varies; without one, [`standardised_error`] is no number.
+    pub fn varies(&self) -> bool {
+        self.rows() > 0 && self.moments().1.iter().any(|var| *var > VARIANCE_MIN)
+    }
+
     /// No rows yet.
     pub fn new(width: usize) -> Self {
         Self { width, values: Vec::new() }
@@ -120,6 +125,9 @@ fn solve(a: &mut [f64], b: &mut [f64], n: usize, outputs: usize) {
     }
 }
 
+/// A column that varies less counts as constant.
+const VARIANCE_MIN: f64 = 1e-12;
+
 /// Standardised mean squared error: squared error over the variance of the truth, averaged over columns that vary; 1 - R2.
 pub fn standardised_error(predicted: &Table, truth: &Table) -> f64 {
     let (_, var) = truth.moments();
@@ -128,7 +136,8 @@ pub fn standardised_error(predicted: &Table, truth: &Table) -> f64 {
         error.iter_mut().zip(p.iter().zip(y)).for_each(|(error, (p, y))| *error += (p - y).powi(2));
     }
     let count = truth.rows() as f64;
-    let varying: Vec<f64> = error.iter().zip(&var).filter(|(_, var)| **var > 1e-12).map(|(error, var)| error / count / var).collect();
+    let varying: Vec<f64> =
+        error.iter().zip(&var).filter(|(_, var)| **var > VARIANCE_MIN).map(|(error, var)| error / count / var).collect();
     if varying.is_empty() { f64::NAN } else { varying.iter().sum::<f64>() / varying.len() as f64 }
 }
 

@@ -14,20 +14,47 @@ use crate::model::{
     latent::LatentModel,
 };
 use anyhow::Result;
+use candle_core::Tensor;
 use serde_json::{Value, json};
-use std::path::Path;
+use std::{collections::BTreeMap, path::Path};
 
 /// Training positions over which the latent's spread is taken.
 const SPREAD_ROWS: usize = 4000;
 
-/// Writes the checkpoint of a learner into `out` and returns what was measured.
+/// A checkpoint that is not written yet.
+pub struct Product {
+    config: ModelConfig,
+    tensors: BTreeMap<String, Tensor>,
+    provenance: Provenance,
+    /// Mean denoising error of held-out windows over all rows of the ladder.
+    pub held_out_loss: f64,
+}
+
+impl Product {
+    /// Writes it, in the place of an older one; what was measured is in it.
+    ///
+    /// # Errors
+    /// If the disk refuses, or the checkpoint would not load.
+    pub fn save(&self, out: &Path) -> Result<()> {
+        Ok(save(out, &self.config, &self.tensors, &self.provenance)?)
+    }
+
+    /// What was measured.
+    pub fn metrics(&self) -> &Value {
+        &self.provenance.metrics
+    }
+}
+
+/// The checkpoint of a learner.
 ///
 /// # Errors
-/// If a tensor operation fails or the disk refuses.
-pub fn ship(task: &Task, learner: &Learner, out: &Path) -> Result<Value> {
+/// If a tensor operation fails.
+pub fn product(task: &Task, learner: &Learner) -> Result<Product> {
     let (networks, tensors) = learner.averaged(task)?;
     let latent_spread = networks.latent.as_ref().map_or(Ok(0.0), |latent| latent_spread(task, latent))?;
-    let metrics = metrics(task, learner, &networks)?;
+    let errors = RefineTask::new(task).held_out_errors(&networks)?;
+    let held_out_loss = errors.iter().sum::<f64>() / errors.len() as f64;
+    let metrics = metrics(task, learner, &networks, &errors)?;
     let config = ModelConfig { latent_spread, ..task.config.clone() };
     let recipe = &task.recipe;
     let provenance = Provenance {
@@ -35,10 +62,9 @@ pub fn ship(task: &Task, learner: &Learner, out: &Path) -> Result<Value> {
         dataset_sha256: task.dataset_digest.clone(),
         recipe: recipe.to_toml(),
         seed: recipe.seed,
-        metrics: metrics.clone(),
+        metrics,
     };
-    save(out, &config, &tensors, &provenance)?;
-    Ok(metrics)
+    Ok(Product { config, tensors, provenance, held_out_loss })
 }
 
 /// How far the prior's mean of c_tau moves over the training data: what the sampler holds a latent jump against.
@@ -48,7 +74,7 @@ fn latent_spread(task: &Task, latent: &LatentModel) -> Result<f32> {
     Ok(spread(&means) as f32)
 }
 
-fn metrics(task: &Task, learner: &Learner, networks: &Networks) -> Result<Value> {
+fn metrics(task: &Task, learner: &Learner, networks: &Networks, errors: &[f64]) -> Result<Value> {
     let round = |value: f64| (value * 1e5).round() / 1e5;
     let probe = match &networks.latent {
         Some(latent) if task.split.train[0].context_dim > 0 => {
@@ -57,13 +83,17 @@ fn metrics(task: &Task, learner: &Learner, networks: &Networks) -> Result<Value>
         }
         _ => Value::Null,
     };
-    let errors: Vec<f64> = RefineTask::new(task).held_out_errors(networks)?.into_iter().map(round).collect();
-    Ok(json!({
+    let errors: Vec<f64> = errors.iter().copied().map(round).collect();
+    let mut metrics = json!({
         "actions": task.action_columns,
         "stage1_attempts": learner.position.attempt + 1,
-        "stage1_probes": learner.probes,
+        "stage1_probes": learner.notes.probes,
         "probe": probe,
         "steps": learner.position.step,
         "held_out_error_by_row": errors,
-    }))
+    });
+    if !learner.notes.changes.is_empty() {
+        metrics["changed_under_way"] = serde_json::to_value(&learner.notes.changes)?;
+    }
+    Ok(metrics)
 }

@@ -7,8 +7,10 @@ use super::{
     Task,
     dataset::window::{BlockShape, Places, blocks},
     learner::{Learner, Scalars},
-    probe::{Evidence, Subjects, latent_probe},
+    probe::{Evidence, Subjects, latent_probe, places},
     recipe::{Gate, Recipe, Stage1},
+    ridge::Table,
+    stage2::HELD_OUT_SEED,
 };
 use crate::model::Networks;
 use crate::model::{
@@ -24,6 +26,8 @@ use serde::Serialize;
 
 /// Places of each side that the gate's probe uses.
 const GATE_ROWS: usize = 6000;
+/// Blocks of the held-out loss.
+const HELD_OUT_BLOCKS: usize = 256;
 
 /// Draws blocks and evaluates the ELBO; stage 2 keeps it on.
 pub struct ElboTask<'a> {
@@ -81,6 +85,21 @@ impl<'a> ElboTask<'a> {
         Ok((terms.loss, scalars))
     }
 
+    /// The ELBO of held-out blocks, always the same ones, with the last weight of the KL; none where no held-out episode has room for one.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn held_out_loss(&self, networks: &Networks) -> Result<Option<f64>> {
+        let (episodes, shape) = (&self.task.split.held_out, BlockShape { batch: HELD_OUT_BLOCKS, ..self.shape.clone() });
+        let places = Places::new(episodes, shape.before, shape.len);
+        if places.is_empty() {
+            return Ok(None);
+        }
+        let batch = blocks(episodes, &places, &shape, &mut Philox::new(HELD_OUT_SEED))?;
+        let (loss, _) = self.loss(networks, &batch, self.stage.kl_weight.end)?;
+        Ok(Some(f64::from(loss.to_scalar::<f32>()?)))
+    }
+
     /// One optimizer step of stage 1.
     ///
     /// # Errors
@@ -120,6 +139,19 @@ pub fn gate(task: &Task, latent: &LatentModel) -> Result<GateResult> {
     let subjects = Subjects { train: &task.split.train, held_out: &task.split.held_out, rows_max: GATE_ROWS };
     let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.config.block_len, &[0])?[0].error) };
     Ok(GateResult { filter: error(Evidence::Filter)?, successor_state: error(Evidence::SuccessorState)? })
+}
+
+/// Whether the contexts that the gate holds the latent against differ at all: an error in units of their variance needs one.
+///
+/// # Errors
+/// If rows are kept in a file and it cannot be read.
+pub fn contexts_vary(task: &Task) -> Result<bool> {
+    let episodes = &task.split.held_out;
+    let mut truth = Table::new(episodes.first().map_or(0, |episode| episode.context_dim));
+    for (episode, t) in places(episodes, GATE_ROWS).into_iter().filter(|(_, t)| *t >= task.config.block_len) {
+        truth.values.extend(episodes[episode].context(t)?.iter().map(|value| f64::from(*value)));
+    }
+    Ok(truth.varies())
 }
 
 /// Seed of the weights of one attempt.

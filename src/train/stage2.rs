@@ -20,7 +20,7 @@ use candle_core::backprop::GradStore;
 use std::ops::Range;
 
 /// Seed of the held-out batches: the same for all runs, so that their errors can be compared.
-const HELD_OUT_SEED: u64 = 0xE7A1;
+pub(super) const HELD_OUT_SEED: u64 = 0xE7A1;
 /// Held-out windows for each row of the ladder.
 const HELD_OUT_WINDOWS: usize = 256;
 

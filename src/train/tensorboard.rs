@@ -3,10 +3,13 @@
 //! Formats: tensorflow `core/util/event.proto`, `core/framework/summary.proto`, `core/lib/io/record_writer.cc`.
 
 use std::{
-    fs::File,
+    fs::{self, File},
     io::{self, Write},
     path::Path,
 };
+
+/// What the name of an event file begins with.
+const NAME: &str = "events.out.tfevents.";
 
 /// CRC-32C (Castagnoli), reflected polynomial.
 const POLYNOMIAL: u32 = 0x82F6_3B78;
@@ -81,23 +84,31 @@ impl Message {
     }
 }
 
+/// Microseconds in the name of an event file.
+fn time_of(name: &str) -> Option<u64> {
+    let (seconds, micros) = name.strip_prefix(NAME)?.strip_suffix(".ada")?.split_once('.')?;
+    Some(seconds.parse::<u64>().ok()? * 1_000_000 + micros.parse::<u64>().ok()?)
+}
+
 /// An event file being written.
 pub struct EventWriter {
     file: File,
 }
 
 impl EventWriter {
-    /// A new file `events.out.tfevents.TIME` in `dir` that continues at `step`: TensorBoard drops what older files say of later steps.
-    /// `seconds` is the wall clock since 1970.
+    /// A new file `events.out.tfevents.TIME` in `dir` that goes on after step `done`: readers drop what older files say of later steps, of
+    /// every curve, so steps must never fall within a directory. `seconds` is the wall clock since 1970.
     ///
     /// # Errors
     /// If the file cannot be written.
-    pub fn create(dir: &Path, step: u64, seconds: f64) -> io::Result<Self> {
-        let name = format!("events.out.tfevents.{:.6}.ada", seconds);
-        let mut writer = Self { file: File::create(dir.join(name))? };
+    pub fn create(dir: &Path, done: u64, seconds: f64) -> io::Result<Self> {
+        // Readers take files in the order of their names, which must be that of their making even where a clock was set back.
+        let newest = fs::read_dir(dir)?.filter_map(|entry| time_of(&entry.ok()?.file_name().to_string_lossy())).max();
+        let micros = newest.map_or(0, |newest| newest + 1).max((seconds * 1e6) as u64);
+        let mut writer = Self { file: File::create(dir.join(format!("{NAME}{:010}.{:06}.ada", micros / 1_000_000, micros % 1_000_000)))? };
         writer.write(&Message::default().double(1, seconds).bytes(3, b"brain.Event:2"))?;
         let start = Message::default().integer(1, 1);
-        writer.write(&Message::default().double(1, seconds).integer(2, step).bytes(7, &start.0))?;
+        writer.write(&Message::default().double(1, seconds).integer(2, done + 1).bytes(7, &start.0))?;
         Ok(writer)
     }
 
@@ -149,7 +160,7 @@ mod tests {
             rest = &rest[16 + length..];
         }
         assert_eq!(records[0], [&[0x09, 0, 0, 0, 0, 0, 0, 0, 0, 0x1A, 13][..], b"brain.Event:2"].concat());
-        assert_eq!(records[1][9..], [0x10, 7, 0x3A, 2, 0x08, 1]);
+        assert_eq!(records[1][9..], [0x10, 8, 0x3A, 2, 0x08, 1]);
         let value = [&[0x0A, 11, 0x0A, 4][..], b"loss", &[0x15], &0.25_f32.to_le_bytes()].concat();
         assert_eq!(records[2][9..], [&[0x10, 0xAC, 0x02, 0x2A, 13][..], &value].concat());
     }

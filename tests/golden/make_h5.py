@@ -48,6 +48,7 @@ def main() -> None:
     write("no_actions", {key: values for key, values in good.items() if key != "actions"})
     write("ragged", good | {"rewards": good["rewards"][:-3]})
     write("flat", good | {"observations": good["observations"].reshape(-1, 3, 1)})
+    write("still", good | {"infos/context": np.ones_like(good["infos/context"])})
     spoiled = good["observations"].copy()
     spoiled[30, 2] = np.nan
     write("nan", good | {"observations": spoiled})

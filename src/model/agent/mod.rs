@@ -14,10 +14,10 @@ mod tests;
 
 pub use descent::Descent;
 pub use episode::Episode;
+pub(in crate::model) use types::infinity_as_null;
 pub use types::{AgentError, Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start};
 
 use crate::model::{Networks, config::ModelConfig, diffusion::ladder::Ladder, diffusion::process::Process};
-use std::collections::BTreeSet;
 
 /// A loaded model.
 pub struct Agent {
@@ -66,7 +66,7 @@ impl Agent {
     /// # Errors
     /// [`AgentError::InvalidOptions`] if an option does not fit the model.
     pub fn open(&self, seed: u64, options: &SamplerOptions) -> Result<Episode, AgentError> {
-        self.check_options(options)?;
+        self.config.check_options(options).map_err(|(field, reason)| AgentError::InvalidOptions { field, reason })?;
         Ok(Episode::new(seed, options.clone()))
     }
 
@@ -117,50 +117,6 @@ impl Agent {
         }
         let [descent] = descents;
         self.finish(descent)
-    }
-
-    /// Whether a session may ask for these options. Sub-steps are those of training: a network that has seen no levels
-    /// between the rungs is lost there (measured on Point-Wind-S: -21 becomes -119 with 2 sub-steps instead of 1). So are the actions of a
-    /// chunk: one that never saw a window begin at an imagined state drifts off (-20 becomes -33 with 2 actions instead of 1).
-    fn check_options(&self, options: &SamplerOptions) -> Result<(), AgentError> {
-        let horizon = self.config.plan_horizon;
-        let invalid = |field, reason: String| Err(AgentError::InvalidOptions { field, reason });
-        if !(1..=horizon).contains(&options.action_horizon) {
-            return invalid("action_horizon", format!("{} is outside 1..={horizon}", options.action_horizon));
-        }
-        if let Err(reason) = Ladder::new(horizon, options.sub_steps, self.config.level_max) {
-            return invalid("sub_steps", reason);
-        }
-        if !self.config.sub_steps_trained.contains(&options.sub_steps) && options.sub_steps != self.config.sampler.sub_steps {
-            return invalid(
-                "sub_steps",
-                format!("this checkpoint was not trained for the levels of {} sub-steps a rung", options.sub_steps),
-            );
-        }
-        let horizons = &self.config.action_horizons_trained;
-        if options.action_horizon != self.config.sampler.action_horizon && !horizons.contains(&options.action_horizon) {
-            let trained: BTreeSet<usize> = horizons.iter().copied().chain([self.config.sampler.action_horizon]).collect();
-            return invalid(
-                "action_horizon",
-                format!("this checkpoint was trained for chunks of {trained:?} actions, not {}", options.action_horizon),
-            );
-        }
-        if !(0.0..=1.0).contains(&options.eta) {
-            return invalid("eta", format!("{} is outside 0..=1", options.eta));
-        }
-        if !(0.0..=10.0).contains(&options.temperature) {
-            return invalid("temperature", format!("{} is outside 0..=10", options.temperature));
-        }
-        if options.kappa.is_nan() || options.kappa < 0.0 {
-            return invalid("kappa", format!("{} is not 0 (off) or above", options.kappa));
-        }
-        if options.kappa > 0.0 && self.config.latent.is_some() && !self.config.refined {
-            return invalid(
-                "kappa",
-                "this checkpoint was not trained with refinement, and zig-zag would harm it; only 0 is allowed".into(),
-            );
-        }
-        Ok(())
     }
 
     /// Values of the right number, all finite.

@@ -1,6 +1,6 @@
 //! What goes into an agent and comes out of it: options, observations, chunks, errors.
 
-use crate::model::trajectory::Layout;
+use crate::model::{nn::plain, trajectory::Layout};
 use serde::{Deserialize, Serialize};
 
 /// How a chunk is sampled; a checkpoint holds defaults chosen on validation episodes, a session may override them.
@@ -146,12 +146,18 @@ pub enum AgentError {
     #[error("the network's output is not finite")]
     NonFinite,
     /// A tensor operation failed: a defect of the model or the program.
-    #[error("tensor: {0}")]
-    Tensor(#[from] candle_core::Error),
+    #[error("tensor: {}", plain(.0))]
+    Tensor(candle_core::Error),
+}
+
+impl From<candle_core::Error> for AgentError {
+    fn from(error: candle_core::Error) -> Self {
+        Self::Tensor(error)
+    }
 }
 
 /// JSON has no infinity: it is written as null.
-mod infinity_as_null {
+pub(in crate::model) mod infinity_as_null {
     use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
     pub fn serialize<S: Serializer>(value: &f32, serializer: S) -> Result<S::Ok, S::Error> {

@@ -10,6 +10,8 @@ use crate::model::nn::{
 use candle_core::Result;
 
 const EPS: f64 = 1e-6;
+/// Blocks.
+pub(super) const DEPTH_MAX: usize = 128;
 
 /// adaLN-Zero block with the standard pre-norm residual stream.
 struct Block {

@@ -4,6 +4,7 @@ mod dit;
 mod unet;
 
 use crate::model::{
+    check::{Unfit, WIDTH_MAX, require, size},
     config::ModelConfig,
     nn::{Activation::Silu, Linear, Value, params::Params, time_embedding::Sinusoid},
 };
@@ -37,6 +38,37 @@ pub enum DenoiserConfig {
         /// Attention heads.
         heads: usize,
     },
+}
+
+impl DenoiserConfig {
+    /// Whether the sizes fit together and `plan_horizon`.
+    ///
+    /// # Errors
+    /// The first field that does not fit.
+    pub fn check(&self, plan_horizon: usize) -> std::result::Result<(), Unfit> {
+        match self {
+            Self::Unet { widths } => {
+                let halvings = widths.len().saturating_sub(1) as u32;
+                let divides = 1_usize.checked_shl(halvings).is_some_and(|factor| plan_horizon.is_multiple_of(factor));
+                let reason = format!("plan_horizon {plan_horizon} must be divisible by 2^(widths - 1) = 2^{halvings}");
+                require(!widths.is_empty(), "denoiser.widths", "must name at least one width")?;
+                require(divides, "denoiser.widths", reason)?;
+                widths.iter().try_for_each(|width| {
+                    size("denoiser.widths", *width, WIDTH_MAX)?;
+                    let groups = unet::GROUPS.min(*width);
+                    let reason = format!("{width} must be below {0} or a multiple of it", unet::GROUPS);
+                    require(width.is_multiple_of(groups), "denoiser.widths", reason)
+                })
+            }
+            Self::Dit { width, depth, heads } => {
+                size("denoiser.width", *width, WIDTH_MAX)?;
+                require(*width >= 4 && width.is_multiple_of(2), "denoiser.width", format!("is {width}, must be even and at least 4"))?;
+                require(*depth <= dit::DEPTH_MAX, "denoiser.depth", format!("is {depth}, must lie in 0..={}", dit::DEPTH_MAX))?;
+                let divides = *heads >= 1 && width.is_multiple_of(*heads);
+                require(divides, "denoiser.heads", format!("is {heads}, must divide denoiser.width {width}"))
+            }
+        }
+    }
 }
 
 /// What the denoiser knows beside the noisy window.

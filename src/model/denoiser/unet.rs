@@ -8,7 +8,8 @@ use candle_core::Result;
 
 /// Width of the embedding of the mean level and of the real steps.
 pub(super) const EMB: usize = 32;
-const GROUPS: usize = 8;
+/// Groups of a norm, or one for each channel where there are fewer.
+pub(super) const GROUPS: usize = 8;
 
 /// Convolution of kernel 5, group norm, Mish.
 struct ConvBlock {

@@ -18,7 +18,7 @@ impl Ladder {
     /// # Errors
     /// A message if a size is zero or `level_max < sub_steps * horizon`, which would repeat levels.
     pub fn new(horizon: usize, sub_steps: usize, level_max: usize) -> Result<Self, String> {
-        if horizon == 0 || sub_steps == 0 || level_max < sub_steps * horizon {
+        if horizon == 0 || sub_steps == 0 || sub_steps.checked_mul(horizon).is_none_or(|rows| rows > level_max) {
             return Err(format!("needs 1 <= sub_steps * plan_horizon <= level_max, got {sub_steps} * {horizon} and {level_max}"));
         }
         Ok(Self { horizon, sub_steps, level_max })
@@ -97,6 +97,12 @@ mod tests {
     fn too_few_levels_are_refused() {
         assert!(Ladder::new(16, 2, 31).is_err());
         assert!(Ladder::new(16, 2, 32).is_ok());
+    }
+
+    /// (2^61 + 1) sub-steps of 8 positions wrapped around to 8 rows and were taken.
+    #[test]
+    fn sizes_do_not_wrap_around() {
+        assert!(Ladder::new(8, (1 << 61) + 1, 8).is_err());
     }
 
     proptest! {

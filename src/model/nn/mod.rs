@@ -33,3 +33,11 @@ pub use linear::Linear;
 pub use norm::{GroupNormMish, LayerNorm};
 pub use params::{Init, Params};
 pub use value::Value;
+
+/// What candle says of an error, without the backtrace that it adds where `RUST_BACKTRACE` is set: that is for a debugger, not for a user.
+pub fn plain(error: &candle_core::Error) -> String {
+    match error {
+        candle_core::Error::WithBacktrace { inner, .. } => plain(inner),
+        other => other.to_string(),
+    }
+}

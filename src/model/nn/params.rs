@@ -21,6 +21,7 @@ pub enum Init {
 
 enum Source {
     Fresh { seed: u64, vars: BTreeMap<String, Var> },
+    Counted { sizes: BTreeMap<String, usize> },
     Loaded { tensors: BTreeMap<String, Tensor>, used: BTreeSet<String>, precision: Precision },
 }
 
@@ -38,6 +39,11 @@ impl Params {
     /// An empty trainable store.
     pub fn fresh(seed: u64) -> Self {
         Self { source: Arc::new(Mutex::new(Source::Fresh { seed, vars: BTreeMap::new() })), prefix: String::new() }
+    }
+
+    /// A store that only counts: networks over it tell how large they would be, and are good for nothing else.
+    pub fn counted() -> Self {
+        Self { source: Arc::new(Mutex::new(Source::Counted { sizes: BTreeMap::new() })), prefix: String::new() }
     }
 
     /// A store of constants, by full name.
@@ -59,7 +65,7 @@ impl Params {
     /// If the parameters are constants (inference), so that a layer may pack them at construction: how it is to hold its weights.
     pub fn frozen(&self) -> Option<Precision> {
         match &*self.lock() {
-            Source::Fresh { .. } => None,
+            Source::Fresh { .. } | Source::Counted { .. } => None,
             Source::Loaded { precision, .. } => Some(*precision),
         }
     }
@@ -80,6 +86,10 @@ impl Params {
                 vars.insert(name, var);
                 Ok(tensor)
             }
+            Source::Counted { sizes } => {
+                sizes.insert(name, shape.elem_count());
+                Tensor::zeros((), DType::F32, &Device::Cpu)?.broadcast_as(shape)
+            }
             Source::Loaded { tensors, used, .. } => {
                 let tensor = tensors.get(&name).ok_or_else(|| candle_core::Error::Msg(format!("tensor {name} is missing")))?;
                 if *tensor.shape() != shape || tensor.dtype() != DType::F32 {
@@ -91,18 +101,26 @@ impl Params {
         }
     }
 
-    /// All trainable variables by name; empty for a loaded store.
-    pub fn vars(&self) -> BTreeMap<String, Var> {
+    /// Tensors asked for, and numbers in all of them; of a counted store.
+    pub fn count(&self) -> (usize, usize) {
         match &*self.lock() {
-            Source::Fresh { vars, .. } => vars.clone(),
-            Source::Loaded { .. } => BTreeMap::new(),
+            Source::Counted { sizes } => (sizes.len(), sizes.values().fold(0, |sum: usize, size| sum.saturating_add(*size))),
+            Source::Fresh { .. } | Source::Loaded { .. } => (0, 0),
         }
     }
 
-    /// Names in a loaded store that no network asked for; empty for a fresh one.
+    /// All trainable variables by name; empty for a store that is not fresh.
+    pub fn vars(&self) -> BTreeMap<String, Var> {
+        match &*self.lock() {
+            Source::Fresh { vars, .. } => vars.clone(),
+            Source::Counted { .. } | Source::Loaded { .. } => BTreeMap::new(),
+        }
+    }
+
+    /// Names in a loaded store that no network asked for; empty for others.
     pub fn unused(&self) -> Vec<String> {
         match &*self.lock() {
-            Source::Fresh { .. } => Vec::new(),
+            Source::Fresh { .. } | Source::Counted { .. } => Vec::new(),
             Source::Loaded { tensors, used, .. } => tensors.keys().filter(|name| !used.contains(*name)).cloned().collect(),
         }
     }

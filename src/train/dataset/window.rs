@@ -100,6 +100,11 @@ impl Places {
         Self { ends: ends.collect(), before }
     }
 
+    /// Whether no episode has room for the piece.
+    pub fn is_empty(&self) -> bool {
+        self.ends.last().is_none_or(|all| *all == 0)
+    }
+
     fn draw(&self, rng: &mut Philox) -> (usize, isize) {
         let drawn = rng.below(self.ends.last().copied().unwrap_or(0));
         let episode = self.ends.partition_point(|end| *end <= drawn);

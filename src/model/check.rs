@@ -1,0 +1,150 @@
+//! The one check of what a model is and how it may be sampled: recipes before training, checkpoints as they are loaded, and sessions as they
+//! are opened all ask here, so that what one of them takes, the others take as well.
+
+use crate::model::{
+    Networks,
+    agent::SamplerOptions,
+    config::ModelConfig,
+    config::Restart,
+    diffusion::ladder::Ladder,
+    latent::LatentConfig,
+    nn::{params::Params, plain},
+};
+use std::collections::BTreeSet;
+
+/// Generated positions of a window.
+const PLAN_HORIZON_MAX: usize = 1024;
+/// Real steps that a network looks back on.
+const HISTORY_MAX: usize = 4096;
+/// Diffusion levels; each costs memory in every loaded model.
+const LEVEL_MAX_MAX: usize = 65_536;
+/// State or action columns; `config.json` lists several numbers for each.
+const COLUMNS_MAX: usize = 4096;
+/// Channels of one layer.
+pub(in crate::model) const WIDTH_MAX: usize = 8192;
+/// Numbers in all networks, and tensors that hold them: within the loader's bounds on the weight file and the manifest.
+const PARAMETERS_MAX: usize = 1 << 27;
+const TENSORS_MAX: usize = 2048;
+/// Factor on the noise.
+const TEMPERATURE_MAX: f32 = 10.0;
+
+/// A field that does not fit.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {reason}")]
+pub struct Unfit {
+    /// Path in `config.json`, e.g. `sampler.kappa`.
+    pub field: String,
+    /// What is wrong and what is allowed.
+    pub reason: String,
+}
+
+/// `Ok` if it holds.
+pub(in crate::model) fn require(holds: bool, field: impl Into<String>, reason: impl Into<String>) -> Result<(), Unfit> {
+    if holds { Ok(()) } else { Err(Unfit { field: field.into(), reason: reason.into() }) }
+}
+
+/// A size from 1 to `max`.
+pub(in crate::model) fn size(field: &str, value: usize, max: usize) -> Result<(), Unfit> {
+    require((1..=max).contains(&value), field, format!("is {value}, must lie in 1..={max}"))
+}
+
+impl ModelConfig {
+    /// Whether this is a model: sizes, units, restarts and sampling defaults.
+    ///
+    /// # Errors
+    /// The first field that does not fit.
+    pub fn check(&self) -> Result<(), Unfit> {
+        self.check_sizes()?;
+        self.check_units()?;
+        let Restart { renoise_distance, cold_distance, latent_jump } = self.restart;
+        for (field, value) in [("renoise_distance", renoise_distance), ("cold_distance", cold_distance), ("latent_jump", latent_jump)] {
+            require(value >= 0.0, format!("restart.{field}"), format!("is {value}, must be 0 or above (inf: never)"))?;
+        }
+        let sampler = |(field, reason)| Unfit { field: format!("sampler.{field}"), reason };
+        self.check_options(&self.sampler).map_err(sampler)?;
+        self.check_parameters()
+    }
+
+    /// Whether a session may ask for these options. Sub-steps are those of training: a network that has seen no levels
+    /// between the rungs is lost there (measured on Point-Wind-S: -21 becomes -119 with 2 sub-steps instead of 1). So are the actions of a
+    /// chunk: one that never saw a window begin at an imagined state drifts off (-20 becomes -33 with 2 actions instead of 1).
+    ///
+    /// # Errors
+    /// The field of [`SamplerOptions`], and what is wrong and what is allowed.
+    pub fn check_options(&self, options: &SamplerOptions) -> Result<(), (&'static str, String)> {
+        let horizon = self.plan_horizon;
+        let holds = |holds: bool, field, reason: &dyn Fn() -> String| if holds { Ok(()) } else { Err((field, reason())) };
+        let SamplerOptions { streaming: _, action_horizon, sub_steps, eta, temperature, kappa, latent: _ } = options;
+        holds((1..=horizon).contains(action_horizon), "action_horizon", &|| format!("{action_horizon} is outside 1..={horizon}"))?;
+        Ladder::new(horizon, *sub_steps, self.level_max).map_err(|reason| ("sub_steps", reason))?;
+        let trained = self.sub_steps_trained.contains(sub_steps) || *sub_steps == self.sampler.sub_steps;
+        holds(trained, "sub_steps", &|| format!("this checkpoint was not trained for the levels of {sub_steps} sub-steps a rung"))?;
+        let horizons = &self.action_horizons_trained;
+        let trained = horizons.contains(action_horizon) || *action_horizon == self.sampler.action_horizon;
+        holds(trained, "action_horizon", &|| {
+            let all: BTreeSet<usize> = horizons.iter().copied().chain([self.sampler.action_horizon]).collect();
+            format!("this checkpoint was trained for chunks of {all:?} actions, not {action_horizon}")
+        })?;
+        holds((0.0..=1.0).contains(eta), "eta", &|| format!("{eta} is outside 0..=1"))?;
+        let warm = (0.0..=TEMPERATURE_MAX).contains(temperature);
+        holds(warm, "temperature", &|| format!("{temperature} is outside 0..={TEMPERATURE_MAX}"))?;
+        holds(*kappa >= 0.0, "kappa", &|| format!("{kappa} is not 0 (off) or above"))?;
+        holds(*kappa == 0.0 || self.latent.is_none() || self.refined, "kappa", &|| {
+            "this checkpoint was not trained with refinement, and zig-zag would harm it; only 0 is allowed".into()
+        })
+    }
+
+    fn check_sizes(&self) -> Result<(), Unfit> {
+        size("layout.state_dim", self.layout.state_dim, COLUMNS_MAX)?;
+        size("layout.action_dim", self.layout.action_dim, COLUMNS_MAX)?;
+        size("plan_horizon", self.plan_horizon, PLAN_HORIZON_MAX)?;
+        size("block_len", self.block_len, HISTORY_MAX)?;
+        size("obs_horizon", self.obs_horizon, HISTORY_MAX)?;
+        size("level_max", self.level_max, LEVEL_MAX_MAX)?;
+        if let Some(LatentConfig { dim, hidden }) = &self.latent {
+            size("latent.dim", *dim, WIDTH_MAX)?;
+            size("latent.hidden", *hidden, WIDTH_MAX)?;
+        }
+        self.denoiser.check(self.plan_horizon)?;
+        let clip = self.state_clip;
+        require(clip.is_finite() && clip > 0.0, "state_clip", format!("is {clip}, must be positive and finite"))
+    }
+
+    /// What only the data tell.
+    fn check_units(&self) -> Result<(), Unfit> {
+        let (state, action) = (self.layout.state_dim, self.layout.action_dim);
+        let units = &self.normalizer;
+        for (field, affine, width) in [("state", &units.state, state), ("action", &units.action, action), ("reward", &units.reward, 1)] {
+            let field = format!("normalizer.{field}");
+            columns(&field, affine.dim(), width)?;
+            columns(&format!("{field}.std"), affine.std.len(), width)?;
+            require(affine.std.iter().all(|std| std.is_normal() && *std > 0.0), &field, "a scale is zero, negative or not finite")?;
+            require(affine.mean.iter().all(|mean| mean.is_finite()), &field, "a mean is not finite")?;
+        }
+        columns("normalizer.state_change_std", units.state_change_std.len(), state)?;
+        let changes = units.state_change_std.iter().all(|std| std.is_finite());
+        require(changes, "normalizer.state_change_std", "a value is not finite")?;
+        columns("action_low", self.action_low.len(), action)?;
+        columns("action_high", self.action_high.len(), action)?;
+        let bounded = |(low, high): (&f32, &f32)| low <= high && low.is_finite() && high.is_finite();
+        let bounds = self.action_low.iter().zip(&self.action_high);
+        require(bounds.into_iter().all(bounded), "action_low", "must not be above action_high, and both finite")?;
+        let spread = self.latent_spread;
+        require(spread.is_finite() && spread >= 0.0, "latent_spread", format!("is {spread}, must be 0 or above"))
+    }
+
+    fn check_parameters(&self) -> Result<(), Unfit> {
+        let params = Params::counted();
+        Networks::new(self, &params).map_err(|error| Unfit { field: "denoiser".into(), reason: plain(&error) })?;
+        let (tensors, parameters) = params.count();
+        let fits = tensors <= TENSORS_MAX && parameters <= PARAMETERS_MAX;
+        let reason = format!(
+            "the networks would have {parameters} parameters in {tensors} tensors, at most {PARAMETERS_MAX} in {TENSORS_MAX} are allowed"
+        );
+        require(fits, "denoiser", reason)
+    }
+}
+
+fn columns(field: &str, found: usize, expected: usize) -> Result<(), Unfit> {
+    require(found == expected, field, format!("has {found} columns, expected {expected}"))
+}

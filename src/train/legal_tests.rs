@@ -1,0 +1,136 @@
+//! Every recipe that the check accepts ships a checkpoint that loads; the others are refused before training.
+
+use super::{Task, dataset::room::Room, recipe::Recipe, tests::recipe_with};
+use crate::model::{
+    Networks,
+    checkpoint::{Provenance, load, save},
+    config::ModelConfig,
+    nn::params::Params,
+};
+use proptest::{prelude::*, sample::select};
+use std::path::Path;
+
+const KEYS: [&str; 44] = [
+    "seed",
+    "checkpoint_every",
+    "log_every",
+    "model.plan_horizon",
+    "model.block_len",
+    "model.obs_horizon",
+    "model.level_max",
+    "model.state_clip",
+    "model.latent.dim",
+    "model.latent.hidden",
+    "model.denoiser.width",
+    "model.denoiser.depth",
+    "model.denoiser.heads",
+    "stage1.steps",
+    "stage1.batch",
+    "stage1.length",
+    "stage1.learning_rate.peak",
+    "stage1.learning_rate.end",
+    "stage1.learning_rate.warm_up",
+    "stage1.weight_decay",
+    "stage1.kl_weight.start",
+    "stage1.kl_weight.end",
+    "stage1.kl_weight.steps",
+    "stage1.reward_weight",
+    "stage1.show_action",
+    "stage1.show_reward",
+    "stage2.steps",
+    "stage2.batch",
+    "stage2.learning_rate.peak",
+    "stage2.weight_decay",
+    "stage2.latent_lr_factor",
+    "stage2.elbo_weight",
+    "stage2.first_action_weight",
+    "stage2.ready_fraction",
+    "stage2.ema_decay_max",
+    "sampler.action_horizon",
+    "sampler.sub_steps",
+    "sampler.eta",
+    "sampler.temperature",
+    "sampler.kappa",
+    "restart.renoise_distance",
+    "restart.cold_distance",
+    "restart.latent_jump",
+    "gate.filter",
+];
+const VALUES: [&str; 22] = [
+    "-1",
+    "0",
+    "1",
+    "2",
+    "3",
+    "4",
+    "6",
+    "8",
+    "16",
+    "24",
+    "-1.0",
+    "0.0",
+    "0.5",
+    "1e-30",
+    "1e38",
+    "1e39",
+    "nan",
+    "inf",
+    "-inf",
+    "1000000",
+    "1000000000000",
+    "2305843009213693953",
+];
+const WIDTHS: [&str; 8] = ["[]", "[4]", "[8, 16]", "[0]", "[9]", "[4, 4, 4]", "[1000000]", "[4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4]"];
+
+/// One act of a checkpoint made from a legal recipe with fresh networks.
+fn ships(recipe: &Recipe) -> Result<(), String> {
+    let again: Recipe = toml::from_str(&recipe.to_toml()).map_err(|error| error.to_string())?;
+    if (Recipe { data: recipe.data.clone(), ..again }) != *recipe {
+        return Err("the recipe in the manifest is another one".into());
+    }
+    // Refused with the units of the data, or because the data set is too short for it: that is before training as well.
+    let Ok(task) = Task::new(recipe.clone(), &Room::default()) else { return Ok(()) };
+    let params = Params::fresh(recipe.seed);
+    Networks::new(&task.config, &params).map_err(|error| error.to_string())?;
+    let tensors = params.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
+    let config = ModelConfig { latent_spread: 1.0, ..task.config };
+    let dir = tempfile::tempdir().map_err(|error| error.to_string())?;
+    let provenance = Provenance { recipe: recipe.to_toml(), ..Provenance::default() };
+    save(dir.path(), &config, &tensors, &provenance).map_err(|error| error.to_string())?;
+    load(dir.path()).map(|_| ()).map_err(|error| error.to_string())
+}
+
+fn check(changes: &[String]) -> Result<(), String> {
+    let restart = "restart={renoise_distance = 0.5, cold_distance = 1.5, latent_jump = 1.0}";
+    let overrides: Vec<&str> = std::iter::once(restart).chain(changes.iter().map(String::as_str)).collect();
+    recipe_with(&overrides).map_or(Ok(()), |recipe| ships(&recipe))
+}
+
+/// A recipe with a negative or infinite `restart`, or an infinite `state_clip`, trained to the end into a checkpoint that was refused.
+#[test]
+fn what_was_legal_and_did_not_load() {
+    for change in ["restart.latent_jump=-1.0", "restart.cold_distance=inf", "restart.renoise_distance=nan", "model.state_clip=inf"] {
+        check(&[change.to_string()]).unwrap_or_else(|error| panic!("{change}: {error}"));
+    }
+    let refused = |change: &str| {
+        recipe_with(&["restart={renoise_distance=1, cold_distance=1, latent_jump=1}", change]).err().map(|error| error.to_string())
+    };
+    assert!(refused("restart.latent_jump=-1.0").unwrap().contains("`restart.latent_jump`: is -1"));
+    assert!(refused("model.state_clip=inf").unwrap().contains("`model.state_clip`: is inf"));
+    assert_eq!(refused("restart.latent_jump=inf"), None, "never");
+    assert!(Path::new("tests/golden/data_good.h5").exists(), "the data set is there, so these were not refused for want of it");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
+    #[test]
+    fn every_legal_recipe_ships_what_loads(
+        changes in prop::collection::vec((select(&KEYS[..]), select(&VALUES[..])), 1..3),
+        widths in prop::option::of(select(&WIDTHS[..])),
+    ) {
+        let dit = "model.denoiser={kind = \"dit\", width = 8, depth = 1, heads = 2}".to_string();
+        let denoiser = widths.map_or(dit, |widths| format!("model.denoiser={{kind = \"unet\", widths = {widths}}}"));
+        let changes: Vec<String> = std::iter::once(denoiser).chain(changes.iter().map(|(key, value)| format!("{key}={value}"))).collect();
+        prop_assert_eq!(check(&changes), Ok(()), "{:?}", changes);
+    }
+}
