@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from ada_diffuser.rollout.film import save_film
 from ada_diffuser.rollout.plot import save_plot
 from ada_diffuser.rollout.readout import Readout, fit
 from ada_diffuser.rollout.report import markdown, table
+from ada_diffuser.rollout.seeds import by_recipe
 
 
 def played(env_name: str, seed: int, steps: int = 20) -> Episode:
@@ -89,6 +91,37 @@ def test_the_table_and_the_markdown_hold_the_numbers() -> None:
     rows = markdown([result], ["kappa", "streaming"]).splitlines()
     assert len(rows) == 3 and len({row.count("|") for row in rows}) == 1
     assert rows[2].startswith("| point-wind-s | fake | inf | true | -2.00 ± 1.00 | -2.00 | 0/2 | 4.50 |")
+
+
+def test_training_seeds_of_a_recipe_get_a_standard_error_of_their_own() -> None:
+    """A fourth training seed lay 15 points off a printed +- 1.7: that was the error over episodes, and the table did not say so."""
+    returns = {"point-seed0": [-10.0, -14.0], "point-seed1": [-20.0, -22.0], "point-seed2": [-30.0, -36.0], "other": [-1.0, -1.0]}
+    results = []
+    for name, values in returns.items():
+        result = finished("point-wind-s", [Episode(i, rewards=[value]) for i, value in enumerate(values)])
+        results.append(replace(result, model=replace(result.model, name=name)))
+    (group,) = by_recipe(results)
+    assert group.recipe == "point" and group.mean_return == -22.0
+    assert group.standard_error == pytest.approx(np.std([-20, -24], ddof=1) / np.sqrt(2))
+    assert group.standard_error_training == pytest.approx(np.std([-12, -21, -33], ddof=1) / np.sqrt(3))
+    stored = json.loads(json.dumps(group.as_json(), allow_nan=False))
+    assert stored["training_seeds"] == ["point-seed0", "point-seed1", "point-seed2"] and stored["mean_returns"] == [-12, -21, -33]
+    assert (stored["standard_error"], stored["standard_error_training_seeds"]) == (2.0, pytest.approx(6.082763))
+    rows = markdown(results, []).splitlines()
+    assert len(rows) == 7 and len({row.count("|") for row in rows}) == 1
+    assert rows[6].startswith("| point-wind-s | point, 3 training seeds | -22.00 ± 2.00 | ± 6.08 | -21.00 | 0/6 |")
+    assert not by_recipe(results[:1]) and "training" not in markdown(results[:1], [])
+
+
+def test_other_settings_are_other_groups() -> None:
+    def one(seed: int, kappa: float) -> Evaluation:
+        result = finished("point-wind-s", [Episode(0, rewards=[-1.0])])
+        options = SamplerOptions(kappa=kappa)
+        return replace(result, model=replace(result.model, name=f"a-seed{seed}"), trial=replace(result.trial, options=options))
+
+    groups = by_recipe([one(seed, kappa) for kappa in (0.0, float("inf")) for seed in (0, 1)])
+    assert [group.as_json()["options"] for group in groups] == [{"kappa": 0.0}, {"kappa": "infinity"}]
+    assert not by_recipe([one(0, 0.0), one(0, 0.0)]), "the same model twice is no second training"
 
 
 @pytest.mark.parametrize("env", ["cheetah-wind-s", "point-wind-s"])

@@ -15,7 +15,7 @@ from ada_diffuser.messages import Chunk, Model, SamplerOptions, Timings
 class Trial:
     """Which episodes, and how they are sampled. The same trial gives the same returns."""
 
-    #: Short name or Gymnasium id.
+    #: Short name, Gymnasium id, or `MODULE:ID`.
     env: str
     #: `name` or `name@digest`; empty: the server's default model.
     model: str = ""
@@ -26,6 +26,8 @@ class Trial:
     vector: int = 1
     #: Overrides of the model's sampling defaults.
     options: SamplerOptions = field(default_factory=SamplerOptions)
+    #: Where episodes are truncated; None: where the environment is registered to be.
+    episode_steps: int | None = None
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.vector < 1 or self.seed < 0:
@@ -129,7 +131,7 @@ class Evaluation:
             "model_digest": self.model.digest,
             "seed": self.trial.seed,
             "vector": self.trial.vector,
-            "options": {name: _plain(value) for name, value in asdict(self.options).items()},
+            "options": plain_options(asdict(self.options)),
             "returns": [round(value, 6) for value in self.returns.tolist()],
             "failed_seeds": [episode.seed for episode in self.episodes if episode.failed],
             "mean_return": round(self.mean_return, 6),
@@ -147,6 +149,6 @@ class Evaluation:
         }
 
 
-def _plain(value: Any) -> Any:
-    """JSON has no infinity; the REST face spells it as a word too."""
-    return "infinity" if value == float("inf") else value
+def plain_options(options: dict[str, Any]) -> dict[str, Any]:
+    """Sampling options for JSON, which has no infinity; the REST face spells it as a word too."""
+    return {name: "infinity" if value == float("inf") else value for name, value in options.items()}
