@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -12,6 +16,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ada_diffuser import environments
+from ada_diffuser.commands.collect import main as collect
+from ada_diffuser.dataset import load_episodes
 from ada_diffuser.environments.half_cheetah import XML, HalfCheetahBody
 
 CHEETAHS = [name for name in environments.NAMES if name.startswith("cheetah")]
@@ -78,10 +84,102 @@ def test_unknown_names_and_options_are_refused_with_the_choices():
         environments.make("cheetah-vel-e", targets="fast")
 
 
-def test_register_all_twice_changes_nothing():
-    before = dict(gym.registry)
-    environments.register_all()
-    assert dict(gym.registry) == before
+def test_gymnasiums_own_way_finds_them_without_an_import(tmp_path):
+    """The README's `gymnasium.make("ada/CheetahWind-S-v0")` failed for want of an import. Gymnasium reads no entry points of
+    packages any more (since 1.0), so the example names the module, and this runs it where nothing else was imported."""
+    code = 'import gymnasium; print(gymnasium.make("ada_diffuser.environments:ada/CheetahWind-S-v0", gain=2.0).unwrapped.gain)'
+    told = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert told.stdout == "2.0\n"
+
+
+# ---- environments of somebody else ----
+
+THEIRS = """
+import gymnasium, numpy
+from gymnasium import spaces
+
+class Theirs(gymnasium.Env):
+    action_space = spaces.Box(-2.0, 2.0, (3,))
+
+    def __init__(self, observations=spaces.Box(-9.0, 9.0, (5,)), actions=None):
+        self.observation_space = observations
+        self.action_space = actions or self.action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.np_random.uniform(size=5), {}
+
+    def step(self, action):
+        self.steps += 1
+        return self.np_random.uniform(size=5), -float(action @ action), self.steps == 7, False, {}
+
+def policy(observation, context):
+    assert context is None
+    return 3 * observation[:3]
+
+def rude(observation, context):
+    return observation
+
+gymnasium.register("theirs/Five-v0", Theirs, max_episode_steps=10)
+gymnasium.register("theirs/Endless-v0", Theirs)
+gymnasium.register("theirs/Choice-v0", Theirs, max_episode_steps=10, kwargs={"actions": spaces.Discrete(3)})
+gymnasium.register("theirs/Dict-v0", Theirs, max_episode_steps=10, kwargs={"observations": spaces.Dict(a=spaces.Box(0, 1, (2,)))})
+gymnasium.register("theirs/Picture-v0", Theirs, max_episode_steps=10, kwargs={"observations": spaces.Box(0, 255, (8, 8, 3))})
+"""
+
+
+@pytest.fixture
+def theirs(tmp_path, monkeypatch):
+    """A module `theirs` in the working directory, that has not been imported."""
+    (tmp_path / "theirs.py").write_text(THEIRS)
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    sys.modules.pop("theirs", None)
+    for name in [name for name in gym.registry if name.startswith("theirs/")]:
+        del gym.registry[name]
+
+
+def test_environments_of_somebody_else_fly_with_their_expert(theirs, capsys):
+    """`--env module:id` was an unknown environment, and an environment without hidden context could not be collected at all."""
+    flags = ["--env", "theirs:theirs/Five-v0", "--episodes", "3", "--quiet"]
+    assert collect(["--out", "a.h5", *flags, "--expert", "theirs:policy"]) == 0
+    episodes = load_episodes(Path("a.h5"))
+    assert episodes.observations.shape == (21, 5) and episodes.actions.shape == (21, 3) and episodes.context is None
+    assert np.allclose(episodes.actions, np.clip(3 * episodes.observations[:, :3], -2, 2), atol=1e-6), "no noise unless asked for"
+    assert np.flatnonzero(episodes.terminals).tolist() == [6, 13, 20] and not episodes.timeouts.any()
+    card = json.loads(Path("a.card.json").read_text())
+    assert card["environment"]["id"] == "theirs:theirs/Five-v0" and card["expert"] == {"kind": "function", "name": "theirs:policy"}
+
+    for name in ("b.h5", "c.h5"):
+        assert collect(["--out", name, *flags, "--expert", "random", "--episode-steps", "4"]) == 0
+    assert load_episodes(Path("b.h5")).timeouts.nonzero()[0].tolist() == [3, 7, 11]
+    assert Path("b.h5").read_bytes() == Path("c.h5").read_bytes()
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--env", "theirs:theirs/Five-v0"], "--expert MODULE:FUNCTION"),
+        (["--env", "theirs:theirs/Five-v0", "--expert", "theirs:rude"], "shape (5,), an action of theirs/Five-v0 has (3,)"),
+        (["--env", "theirs:theirs/Five-v0", "--expert", "theirs:polite"], "no attribute 'polite'"),
+        (["--env", "theirs:theirs/Endless-v0", "--expert", "random"], "--episode-steps"),
+        (["--env", "theirs:theirs/Choice-v0", "--expert", "random"], "Discrete(3) as its actions"),
+        (["--env", "theirs:theirs/Dict-v0", "--expert", "random"], "FlattenObservation"),
+        (["--env", "theirs:theirs/Picture-v0", "--expert", "random"], "(8, 8, 3)"),
+        (["--env", "theirs:theirs/Six-v0", "--expert", "random"], "unknown environment"),
+        (["--env", "thiers:theirs/Five-v0"], "cannot import 'thiers'"),
+        (["--env", "CartPole-v1", "--expert", "random"], "Discrete(2) as its actions"),
+        (["--env", "no such name"], "no such name"),
+    ],
+)
+def test_what_cannot_be_taken_is_told_in_one_sentence(theirs, capsys, flags, words):
+    """A discrete or dict space ended in a traceback, after the episodes were begun."""
+    assert collect(["--out", "a.h5", "--quiet", *flags]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1 and error.startswith("ada-collect: ")
+    assert not Path("a.h5").exists()
 
 
 # ---- PointWind-S ----

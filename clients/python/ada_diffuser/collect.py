@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -14,20 +14,18 @@ from . import environments
 from .dataset import Episodes
 from .experts import Expert
 
-NOISE_POINT = (0.1, 0.2, 0.3)
-NOISE_CHEETAH = (0.0, 0.05, 0.1)
-
 
 @dataclass(frozen=True)
 class Job:
     """What to fly, apart from the expert.
 
     Attributes:
-        env: short name or Gymnasium id.
+        env: short name, Gymnasium id, or MODULE:ID.
         options: keyword arguments of the environment.
         episodes: how many.
         noise: standard deviations of action noise; each episode draws one.
         seed: of the environment, the noise and the choice among `noise`.
+        episode_steps: where episodes are truncated; None: where the environment is registered to be.
     """
 
     env: str
@@ -35,31 +33,44 @@ class Job:
     episodes: int
     noise: tuple[float, ...]
     seed: int
+    episode_steps: int | None = None
 
 
-def collect(job: Job, expert: Expert, progress: Callable[[range], Iterator[int]] = iter) -> tuple[Episodes, int]:
-    """Fly the episodes of one session; returns them and how many failed. A pure function of its arguments."""
-    env = environments.make(job.env, **job.options)
+def collect(job: Job, expert: Expert, progress: Callable[[int], object] = lambda episodes: None) -> tuple[Episodes, int]:
+    """Fly the episodes of one session; returns them and how many failed. A pure function of its arguments.
+
+    `progress` is called with the number of episodes just flown.
+    """
+    env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
     _check_fit(env, expert)
     env_seed, noise_seed = np.random.SeedSequence(job.seed).generate_state(2)
     rng = np.random.default_rng(noise_seed)
     flown, failures = [], 0
-    for episode in progress(range(job.episodes)):
+    for episode in range(job.episodes):
         std = float(rng.choice(job.noise))
         flown.append(_fly(env, expert, std, rng, int(env_seed) if episode == 0 else None))
-        failures += env.unwrapped.failed(float(flown[-1].rewards.sum()))
+        failures += environments.failed(env, float(flown[-1].rewards.sum()))
+        progress(1)
     env.close()
-    columns = {name: np.concatenate([getattr(e, name) for e in flown]) for name in Episodes.__dataclass_fields__}
-    return Episodes(**columns), failures
+    columns = {name: [getattr(e, name) for e in flown] for name in Episodes.__dataclass_fields__}
+    return Episodes(**{name: None if parts[0] is None else np.concatenate(parts) for name, parts in columns.items()}), failures
 
 
 def _check_fit(env: gym.Env, expert: Expert) -> None:
-    if not hasattr(env.unwrapped, "context"):
+    context = _context(env)
+    made_for = expert.sizes(0 if context is None else len(context))
+    if made_for is None:
+        return
+    if context is None:
         raise ValueError(f"{env.spec.id} has no hidden context that an expert could see")
     wanted = env.observation_space.shape[0], env.action_space.shape[0]
-    made_for = expert.sizes(len(env.unwrapped.context))
     if made_for != wanted:
         raise ValueError(f"the expert is made for observations and actions of {made_for} numbers, the environment has {wanted}")
+
+
+def _context(env: gym.Env) -> np.ndarray | None:
+    """What acts on the coming step, where the environment tells it ahead."""
+    return getattr(env.unwrapped, "context", None)
 
 
 def _fly(env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, seed: int | None) -> Episodes:
@@ -69,18 +80,23 @@ def _fly(env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, see
     steps: list[tuple[Any, ...]] = []
     ended = False
     while not ended:
-        wanted = expert.act(observation, env.unwrapped.context)
+        wanted = expert.act(observation, _context(env))
+        if wanted.shape != low.shape:
+            raise ValueError(f"the expert answered an array of shape {wanted.shape}, an action of {env.spec.id} has {low.shape}")
         action = np.clip(wanted + std * rng.standard_normal(wanted.shape), low, high).astype(np.float32)
         following, reward, terminal, timeout, info = env.step(action)
-        steps.append((observation, action, reward, terminal, timeout, info["context"], std))
+        steps.append((observation, action, reward, terminal, timeout, std, info.get("context")))
         observation, ended = following, terminal or timeout
-    dtypes = (np.float32, np.float32, np.float32, np.bool_, np.bool_, np.float32, np.float32)
-    return Episodes(*(np.array(column, dtype) for column, dtype in zip(zip(*steps, strict=True), dtypes, strict=True)))
+    *columns, contexts = zip(*steps, strict=True)
+    dtypes = (np.float32, np.float32, np.float32, np.bool_, np.bool_, np.float32)
+    arrays = [np.array(column, dtype) for column, dtype in zip(columns, dtypes, strict=True)]
+    told = None if contexts[0] is None else np.array(contexts, np.float32).reshape(len(contexts), -1)
+    return Episodes(*arrays, context=told)
 
 
 def default_noise(env: gym.Env) -> tuple[float, ...]:
-    """Action noise that shows states off the expert's path; more of it stops the cheetah's gait."""
-    return NOISE_POINT if isinstance(env.unwrapped, environments.PointWindS) else NOISE_CHEETAH
+    """Action noise that shows states off the expert's path, as the environment names it; else none."""
+    return getattr(env.unwrapped, "action_noise", (0.0,))
 
 
 def data_card(job: Job, expert: Expert, episodes: Episodes, failures: int) -> dict[str, Any]:
@@ -88,7 +104,7 @@ def data_card(job: Job, expert: Expert, episodes: Episodes, failures: int) -> di
     returns = episodes.returns()
     return {
         "format": "d4rl-hdf5",
-        "environment": {"id": job.env, "options": job.options},
+        "environment": {"id": job.env, "options": job.options} | ({"episode_steps": job.episode_steps} if job.episode_steps else {}),
         "episodes": len(returns),
         "steps": len(episodes.rewards),
         "seed": job.seed,

@@ -23,8 +23,8 @@ class Episodes:
         rewards: (N,), float32.
         terminals: (N,), bool; the task ended in this step.
         timeouts: (N,), bool; the clock ended the episode in this step.
-        context: (N, context), float32; what was hidden while the action was executed.
         action_noise: (N,), float32; standard deviation of the episode's action noise.
+        context: (N, context), float32; what was hidden while the action was executed; None where the environment tells none.
     """
 
     observations: np.ndarray
@@ -32,8 +32,8 @@ class Episodes:
     rewards: np.ndarray
     terminals: np.ndarray
     timeouts: np.ndarray
-    context: np.ndarray
     action_noise: np.ndarray
+    context: np.ndarray | None = None
 
     def returns(self) -> np.ndarray:
         """Undiscounted return of each episode, shape (episodes,), float64."""
@@ -42,16 +42,21 @@ class Episodes:
         return np.add.reduceat(self.rewards.astype(np.float64), starts)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """D4RL path -> array."""
-        return {
-            "observations": self.observations,
-            "actions": self.actions,
-            "rewards": self.rewards,
-            "terminals": self.terminals,
-            "timeouts": self.timeouts,
-            "infos/context": self.context,
-            "infos/action_noise": self.action_noise,
-        }
+        """D4RL path -> array, for what there is."""
+        found = {path: getattr(self, name) for name, path in _PATHS.items()}
+        return {path: column for path, column in found.items() if column is not None}
+
+
+_PATHS = {
+    "observations": "observations",
+    "actions": "actions",
+    "rewards": "rewards",
+    "terminals": "terminals",
+    "timeouts": "timeouts",
+    "context": "infos/context",
+    "action_noise": "infos/action_noise",
+}
+"""Field of `Episodes` -> path in the file, in the order of writing."""
 
 
 def save_episodes(episodes: Episodes, path: Path) -> str:
@@ -68,8 +73,8 @@ def save_episodes(episodes: Episodes, path: Path) -> str:
 def load_episodes(path: Path) -> Episodes:
     """Read what `save_episodes` wrote. Raises `KeyError` naming a missing column."""
     with h5py.File(path, "r") as file:
-        names = {"context": "infos/context", "action_noise": "infos/action_noise"}
-        return Episodes(**{field: file[names.get(field, field)][()] for field in Episodes.__dataclass_fields__})
+        present = {name: path for name, path in _PATHS.items() if name != "context" or path in file}
+        return Episodes(**{name: file[path][()] for name, path in present.items()})
 
 
 def card_path(path: Path) -> Path:

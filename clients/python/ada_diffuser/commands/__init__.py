@@ -3,10 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import io
+import os
+import sys
+from collections.abc import Callable, Sequence
+from types import ModuleType
+
+from ada_diffuser.errors import AdaError
 
 DEFAULT_URL = "127.0.0.1:7777"
+
+
+_ENV_HELP = "short name (point-wind-s, cheetah-wind-s, cheetah-wind-e, cheetah-vel-e), Gymnasium id, or MODULE:ID to import it from"
+
+
+def add_environment_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which environment, and how long its episodes are."""
+    parser.add_argument("--env", required=True, metavar="NAME", help=_ENV_HELP)
+    parser.add_argument(
+        "--episode-steps", type=int, metavar="N", help="truncate episodes there (default: as the environment is registered)"
+    )
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,17 +51,42 @@ def parse_settings(words: Sequence[str]) -> dict[str, str]:
     return settings
 
 
-@contextmanager
-def progress_bar(steps: int, title: str) -> Iterator[Callable[[int], object]]:
-    """A bar on stderr where that is a terminal."""
-    from tqdm import tqdm
+def run_command(program: str, run: Callable[[], object], *, status: int = 1) -> int:
+    """Runs the body of a command: 0; `status` with one sentence on stderr for what the user can mend; 130 when interrupted."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that cannot spell the results still gets them
+    # Modules of the caller's (MODULE:ID) are found in the working directory, as by `python -m`; installed ones come first.
+    sys.path.append(os.getcwd())
+    try:
+        run()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Nobody reads any more (`| head`). Python flushes stdout once more at exit, and would complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return status
+    except (AdaError, ValueError, OSError, ImportError) as error:
+        print(f"{program}: {_sentence(error)}", file=sys.stderr)
+        return status
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr)
+        return 130
+    finally:
+        sys.path.pop()
+    return 0
 
-    with tqdm(total=steps, desc=title, unit="step", disable=None, leave=False) as bar:
-        yield bar.update
+
+def import_environments() -> ModuleType:
+    """The simulators, only where they are used: `--help` must work, and a run must say what to install, without the extra."""
+    try:
+        from ada_diffuser import environments
+    except RuntimeError as error:
+        raise ValueError(f"MuJoCo cannot be loaded: {error}") from error
+    return environments
 
 
-def sentence(error: Exception) -> str:
-    """What the user should read of an error."""
+def _sentence(error: Exception) -> str:
+    """What the user should read of an error, on one line."""
     if isinstance(error, ImportError):
         return f"{error}; install with: pip install 'ada-diffuser[mujoco]'"
-    return str(error)
+    return " ".join(str(error).split())

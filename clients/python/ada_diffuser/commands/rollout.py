@@ -3,37 +3,45 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ada_diffuser.client import Client
-from ada_diffuser.commands import add_server_arguments, parse_settings, progress_bar, sentence, server_url
-from ada_diffuser.errors import AdaError
+from ada_diffuser.commands import (
+    add_environment_arguments,
+    add_server_arguments,
+    import_environments,
+    parse_settings,
+    run_command,
+    server_url,
+)
+from ada_diffuser.commands.outputs import check_output, save_json
+from ada_diffuser.commands.progress import progress
 from ada_diffuser.messages import SamplerOptions
 
+if TYPE_CHECKING:
+    from ada_diffuser.rollout import Evaluation
+    from ada_diffuser.rollout.readout import Readout
+
 _ABOUT = """\
-Drives a registered environment with a model on a running ada-server and prints what it earned and what it cost.
+Drives an environment with a model on a running ada-server and prints what it earned and what it cost.
+Folders of --json, --plot and --film are made before the first episode, and one that fails does not keep back the others.
 Episode e runs with seed SEED + e, in the environment and in the model, so the same command gives the same returns and all
 models see the same episodes. Failed is what the environment says failed: point-wind-s below -60 (a pilot that knows only the
 mean wind: -47), the cheetahs below three quarters of what standing still earns (wind tasks -225)."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; 0, or 1 with a line on stderr."""
+    """Entry point; 0, 1 with a line on stderr, or 130 when interrupted."""
     arguments = _parser().parse_args(argv)
-    try:
-        _run(arguments)
-    except (AdaError, ValueError, OSError, ImportError) as error:
-        print(f"ada-rollout: {sentence(error)}", file=sys.stderr)
-        return 1
-    return 0
+    return run_command("ada-rollout", lambda: _run(arguments))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("ada-rollout", description=_ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", required=True, help="short name (cheetah-wind-s, ...) or Gymnasium id")
+    add_environment_arguments(parser)
     add_server_arguments(parser)
     parser.add_argument("--model", default="", help="name or name@digest (default: the server's default model)")
     parser.add_argument("--episodes", type=int, default=10, help="episodes to run (default 10)")
@@ -48,33 +56,54 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    # Here and not above: `--help` must work, and a run must say what to install, without the extra.
-    from ada_diffuser.environments import EPISODE_STEPS
-    from ada_diffuser.rollout import Trial, evaluate
+    options = SamplerOptions.parse(parse_settings(arguments.option))
+    check_output("--json", arguments.json)
+    check_output("--plot", arguments.plot, ".png", ".pdf", ".svg", ".jpg")
+    check_output("--film", arguments.film, ".gif")
+    import_environments()
+    from ada_diffuser.rollout import Trial, check, evaluate
     from ada_diffuser.rollout.readout import fit
     from ada_diffuser.rollout.report import table
 
-    options = SamplerOptions.parse(parse_settings(arguments.option))
-    trial = Trial(arguments.env, arguments.model, arguments.episodes, arguments.seed, arguments.vector, options)
+    trial = Trial(arguments.env, arguments.model, arguments.episodes, arguments.seed, arguments.vector, options, arguments.episode_steps)
     with Client(server_url(arguments.url, arguments.face)) as client:
         client.wait_ready(arguments.wait)
-        with progress_bar(trial.episodes * EPISODE_STEPS, trial.env) as progress:
-            result = evaluate(client, trial, progress)
+        steps = trial.episodes * check(client, trial)
+        with progress(steps, trial.env, "step") as advance:
+            result = evaluate(client, trial, advance)
     readout = fit(result.episodes)
     if arguments.table:
-        print(table(result, readout))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result.as_json(), indent=1) + "\n", encoding="utf-8")
-    if arguments.plot:
-        from ada_diffuser.rollout.plot import save_plot
+        print(table(result, readout), flush=True)
+    _write_all(arguments, result, readout)
 
-        save_plot(result, readout, arguments.plot)
-        print(f"plot: {arguments.plot}")
-    if arguments.film:
-        from ada_diffuser.rollout.film import save_film
 
-        reason = save_film(trial.env, result.episodes[-1], readout, arguments.film)
-        print(f"film: {arguments.film}" if reason is None else f"film: skipped, no way to render here ({reason})")
+def _write_all(arguments: argparse.Namespace, result: Evaluation, readout: Readout | str) -> None:
+    """Every file that was asked for, whatever becomes of the others. Raises `ValueError` naming those that failed."""
+    from ada_diffuser.rollout.film import save_film
+    from ada_diffuser.rollout.plot import save_plot
+
+    def save_film_or_say_why(path: Path) -> None:
+        reason = save_film(result.trial.env, result.episodes[-1], readout, path)
+        print(f"film: {path}" if reason is None else f"film: skipped, no way to render here ({reason})")
+
+    def save_plot_and_say_so(path: Path) -> None:
+        save_plot(result, readout, path)
+        print(f"plot: {path}")
+
+    wanted: list[tuple[str, Path | None, Callable[[Path], None]]] = [
+        ("--json", arguments.json, lambda path: save_json(result.as_json(), path)),
+        ("--plot", arguments.plot, save_plot_and_say_so),
+        ("--film", arguments.film, save_film_or_say_why),
+    ]
+    failures = []
+    for flag, path, write in wanted:
+        try:
+            if path:
+                write(path)
+        except Exception as error:  # a picture may fail in any way, and the next file is wanted all the same
+            failures.append(f"{flag} {path}: {error}")
+    if failures:
+        raise ValueError("not written: " + "; ".join(failures))
 
 
 if __name__ == "__main__":

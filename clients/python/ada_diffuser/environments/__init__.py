@@ -1,7 +1,7 @@
 """Environments with a hidden context; importing this module registers them with Gymnasium.
 
-    import gymnasium, ada_diffuser.environments
-    env = gymnasium.make("ada/PointWind-S-v0")
+    import gymnasium
+    env = gymnasium.make("ada_diffuser.environments:ada/PointWind-S-v0")
 
 `-S` contexts change within an episode, `-E` contexts between episodes. The context is in `info["context"]` alone:
 the array returned by step `t` acted while `a_t` was executed, the one returned by `reset` acts on the first step.
@@ -9,47 +9,70 @@ the array returned by step `t` acted while `a_t` was executed, the one returned 
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import gymnasium as gym
+from gymnasium import spaces
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
 from .point_wind import PointWindS
+from .task import NAMES, HiddenTask
 
-__all__ = ["EPISODE_STEPS", "NAMES", "CheetahVelE", "CheetahWindE", "CheetahWindS", "PointWindS", "make", "register_all"]
-
-EPISODE_STEPS = 200
-"""Steps after which every episode here is truncated; none terminates."""
-
-NAMES = {
-    "point-wind-s": "ada/PointWind-S-v0",
-    "cheetah-wind-s": "ada/CheetahWind-S-v0",
-    "cheetah-wind-e": "ada/CheetahWind-E-v0",
-    "cheetah-vel-e": "ada/CheetahVel-E-v0",
-}
-"""Short name for command lines -> Gymnasium id."""
-
-_ENTRY_POINTS = {
-    "ada/PointWind-S-v0": f"{__name__}.point_wind:PointWindS",
-    "ada/CheetahWind-S-v0": f"{__name__}.cheetah:CheetahWindS",
-    "ada/CheetahWind-E-v0": f"{__name__}.cheetah:CheetahWindE",
-    "ada/CheetahVel-E-v0": f"{__name__}.cheetah:CheetahVelE",
-}
+__all__ = ["NAMES", "CheetahVelE", "CheetahWindE", "CheetahWindS", "HiddenTask", "PointWindS", "failed", "make", "steps_max"]
 
 
-def register_all() -> None:
-    """Register the four environments; a second call changes nothing."""
-    for env_id, entry_point in _ENTRY_POINTS.items():
-        if env_id not in gym.registry:
-            gym.register(env_id, entry_point=entry_point, max_episode_steps=EPISODE_STEPS)
+def make(name: str, *, episode_steps: int | None = None, **options: Any) -> gym.Env:
+    """Make an environment by short name, Gymnasium id, or `MODULE:ID`, where the module is imported first.
+
+    `episode_steps` truncates episodes there, and not where the environment was registered to be. Observations and actions must
+    be vectors (a `Box` of one dimension), of any length. Raises `ValueError` with the choices or the reason.
+    """
+    module, _, env_id = name.rpartition(":")
+    if module:
+        _import(module)
+    env_id = NAMES.get(env_id, env_id)
+    if episode_steps is not None and episode_steps < 1:
+        raise ValueError("an episode has at least 1 step")
+    try:
+        env = gym.make(env_id, max_episode_steps=episode_steps, disable_env_checker=True, **options)
+    except gym.error.UnregisteredEnv as error:
+        known = "a registered Gymnasium id or MODULE:ID"
+        raise ValueError(f"unknown environment {name!r} ({error}); choose one of {', '.join(NAMES)}, {known}") from None
+    except Exception as error:  # whatever the constructor of somebody else's environment may raise
+        raise ValueError(f"environment {name} cannot be made: {error}") from error
+    _check_vectors(name, env)
+    if env.spec is None or env.spec.max_episode_steps is None:
+        raise ValueError(f"environment {name} is registered without a limit of steps: say how long an episode is (--episode-steps N)")
+    return env
 
 
-def make(name: str, **options: Any) -> gym.Env:
-    """Make an environment by short name or Gymnasium id. Raises `ValueError` naming the choices for an unknown name."""
-    env_id = NAMES.get(name, name)
-    if env_id not in gym.registry:
-        raise ValueError(f"unknown environment {name!r}; choose one of {', '.join(NAMES)} or a registered Gymnasium id")
-    return gym.make(env_id, disable_env_checker=True, **options)
+def steps_max(env: gym.Env) -> int:
+    """Steps after which an episode of an environment from `make` is truncated."""
+    steps = env.spec and env.spec.max_episode_steps
+    if not steps:
+        raise ValueError(f"{env} has no limit of steps")
+    return steps
 
 
-register_all()
+def failed(env: gym.Env, episode_return: float) -> bool:
+    """Whether the environment calls a finished episode failed; one that has no opinion never does."""
+    opinion = getattr(env.unwrapped, "failed", None)
+    return bool(callable(opinion) and opinion(episode_return))
+
+
+def _import(module: str) -> None:
+    try:
+        importlib.import_module(module)
+    except Exception as error:  # a module of the caller's: it may fail in any way
+        raise ValueError(f"cannot import {module!r} to find its environments: {type(error).__name__}: {error}") from error
+
+
+def _check_vectors(name: str, env: gym.Env) -> None:
+    """Observations and actions travel as vectors of numbers."""
+    for what, space, cure in (
+        ("observations", env.observation_space, "gymnasium.wrappers.FlattenObservation makes vectors of boxes and of dicts of boxes"),
+        ("actions", env.action_space, "choices are no numbers that could be diffused"),
+    ):
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise ValueError(f"environment {name} has {space} as its {what}, but only vectors (a Box of one dimension) are taken; {cure}")

@@ -6,20 +6,21 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from .half_cheetah import ACTION_SIZE, OBSERVATION_SIZE, HalfCheetahBody
+from .task import HiddenTask
 
 ACTION_COST = 0.05
 WIND_TARGET = 1.5
 """Wanted speed of the wind tasks, m/s."""
-NOMINAL_STEPS = 200
 RENDER_SIZE = (480, 360)
+GRID_SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5)
+"""Speeds that get an expert of their own where the environment draws from a continuum."""
 
 
-class CheetahTask(gym.Env[np.ndarray, np.ndarray]):
+class CheetahTask(HiddenTask):
     """What the cheetah tasks share: reward `-|v - v*| - .05 a.a`, episodes numbered within a session, rendering.
 
     A *session* starts at the first `reset` and at each `reset(seed=...)`; its episodes are numbered 0, 1, ...
@@ -67,7 +68,7 @@ class CheetahTask(gym.Env[np.ndarray, np.ndarray]):
 
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode earned little more than standing still would have."""
-        return episode_return < -0.75 * NOMINAL_STEPS * self._target()
+        return episode_return < -0.75 * self.episode_steps * self._target()
 
     def render(self) -> np.ndarray | None:
         """One frame (360, 480, 3) uint8 from the camera that tracks the cheetah; needs a working `MUJOCO_GL`."""
@@ -132,7 +133,7 @@ class _CheetahWind(CheetahTask):
         return self._context()
 
 
-class CheetahWindS(_CheetahWind):
+class CheetahWindS(_CheetahWind, name="cheetah-wind-s", id="ada/CheetahWind-S-v0"):
     """Wind `5 + 5 sin(.5 t + phi)` N in step `t`: 0 to 10 N, a period of 12.6 steps.
 
     Args:
@@ -151,7 +152,7 @@ class CheetahWindS(_CheetahWind):
         return self._step
 
 
-class CheetahWindE(_CheetahWind):
+class CheetahWindE(_CheetahWind, name="cheetah-wind-e", id="ada/CheetahWind-E-v0"):
     """Wind `10 + 5 sin(.8 i + phi)` N throughout episode `i`: 5 to 15 N.
 
     Args:
@@ -171,7 +172,7 @@ class CheetahWindE(_CheetahWind):
         return self._episode
 
 
-class CheetahVelE(CheetahTask):
+class CheetahVelE(CheetahTask, name="cheetah-vel-e", id="ada/CheetahVel-E-v0"):
     """A wanted speed that is constant within an episode and shows only in the reward.
 
     Args:
@@ -188,6 +189,11 @@ class CheetahVelE(CheetahTask):
             raise ValueError("targets must name at least one speed")
         self.targets = targets if isinstance(targets, str) else tuple(float(v) for v in targets)
         self._speed = 0.0
+
+    @property
+    def search_targets(self) -> tuple[float, ...]:
+        """One expert a speed."""
+        return GRID_SPEEDS if isinstance(self.targets, str) else tuple(sorted(set(self.targets)))
 
     def _draw_context(self, starts_session: bool) -> None:
         if self.targets == "uniform":

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
+import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,12 +19,12 @@ class Expert(Protocol):
 
     card: dict[str, Any]
 
-    def sizes(self, context_size: int) -> tuple[int, int]:
-        """(observation size, action size) it is made for, in an environment with that context size."""
+    def sizes(self, context_size: int) -> tuple[int, int] | None:
+        """(observation size, action size) it is made for, in an environment with that context size; None: it needs no context."""
         ...
 
-    def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
-        """Action for an observation and the context of the coming step; not clipped."""
+    def act(self, observation: np.ndarray, context: np.ndarray | None) -> np.ndarray:
+        """Action for an observation and the context of the coming step, None where the environment tells none; not clipped."""
         ...
 
 
@@ -38,6 +41,47 @@ class AnalyticPilot:
     def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
         """See `Expert.act`; observation (4,), context (2,), action (2,)."""
         return (-3.0 * observation[:2] - 2.5 * observation[2:] - context) / 4.0
+
+
+@dataclass
+class CalledExpert:
+    """Somebody's own function of the observation and the context.
+
+    Attributes:
+        function: called as `function(observation, context)`; the context is None where the environment tells none.
+        card: where it comes from.
+    """
+
+    function: Callable[[np.ndarray, np.ndarray | None], Any]
+    card: dict[str, Any]
+
+    def sizes(self, context_size: int) -> None:
+        """See `Expert.sizes`."""
+        return None
+
+    def act(self, observation: np.ndarray, context: np.ndarray | None) -> np.ndarray:
+        """See `Expert.act`."""
+        return np.asarray(self.function(observation, context), np.float64)
+
+
+def import_expert(name: str) -> CalledExpert:
+    """`MODULE:FUNCTION` as an expert. Raises `ValueError` with the reason why it is none."""
+    module, _, function = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except Exception as error:  # a module of the caller's: it may fail in any way
+        raise ValueError(f"--expert {name}: {type(error).__name__}: {error}") from error
+    if not callable(found):
+        raise ValueError(f"--expert {name} is no function of an observation and a context")
+    return CalledExpert(found, {"kind": "function", "name": name})
+
+
+def random_expert(low: np.ndarray, high: np.ndarray, seed: int) -> CalledExpert:
+    """Uniform actions between bounds (actions,). Raises `ValueError` for infinite ones."""
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError("--expert random draws between the bounds of the actions, and this environment has none")
+    rng = np.random.default_rng([seed, 3])
+    return CalledExpert(lambda observation, context: rng.uniform(low, high), {"kind": "random"})
 
 
 @dataclass(frozen=True)
@@ -108,5 +152,5 @@ def load_expert(path: Path) -> PolicyBank:
             policies = [LinearPolicy(*arrays) for arrays in stacked]
             targets = file.get("targets")
             return PolicyBank(policies, targets, json.loads(str(file["card"])))
-    except (KeyError, ValueError, EOFError) as error:
+    except (KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is not an expert written by ada-collect: {error}") from error

@@ -22,8 +22,6 @@ GAIN_SPREAD = 0.2
 JUDGE_EVERY = 5
 JUDGE_EPISODES = 9
 FRESH_EPISODES = 48
-GRID_SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5)
-"""Speeds that get a policy of their own where the environment draws from a continuum."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +46,11 @@ class ExpertRecipe:
     judge_noise: tuple[float, ...] = (0.0, 0.05, 0.1)
     ars: ArsSettings = field(default_factory=ArsSettings)
 
+    @property
+    def iterations(self) -> int:
+        """Of all searches together."""
+        return max(1, len(self.targets)) * self.seeds * self.ars.iterations
+
     def to_json(self) -> dict[str, Any]:
         """The recipe as plain JSON values."""
         return {**asdict(self), "targets": list(self.targets), "judge_noise": list(self.judge_noise)}
@@ -59,22 +62,21 @@ def recipe_for(env: gym.Env, options: dict[str, Any], seed: int, seeds: int, ars
     Raises `ValueError` for an environment that has neither.
     """
     task = env.unwrapped
-    if isinstance(task, environments.PointWindS):
+    env_id, module = env.spec.id, type(task).__module__
+    if not isinstance(task, environments.HiddenTask):
+        raise ValueError(f"{env_id} has no expert of its own; give one: --expert MODULE:FUNCTION, --expert FILE.npz, or --expert random")
+    if task.search_targets is None:
         return None
-    env_id = env.spec.id if env.spec else type(task).__name__
-    if isinstance(task, environments.CheetahVelE):
-        targets = GRID_SPEEDS if isinstance(task.targets, str) else tuple(sorted(set(task.targets)))
-        return ExpertRecipe(env_id, options, seed, seeds, targets, ars=ars)
-    if isinstance(task, environments.CheetahWindS | environments.CheetahWindE):
-        return ExpertRecipe(env_id, options, seed, seeds, ars=ars)
-    raise ValueError(f"{env_id} has no expert of its own; give one with --expert")
+    if not module.startswith(environments.__name__):
+        env_id = f"{module}:{env_id}"  # the processes that search must import it, too
+    return ExpertRecipe(env_id, options, seed, seeds, task.search_targets, ars=ars)
 
 
-def make_expert(recipe: ExpertRecipe | None, progress: Callable[[int, int], None] = lambda done, total: None) -> Expert:
+def make_expert(recipe: ExpertRecipe | None, progress: Callable[[int], object] = lambda iterations: None) -> Expert:
     """Run the searches of a recipe, two at a time; without a recipe, the analytic pilot.
 
-    `progress(done, total)` is called now and then with iterations of all searches. The result does not depend on the number
-    of processes.
+    `progress` is called now and then with the number of iterations just made, `recipe.iterations` in all. The result does not
+    depend on the number of processes.
     """
     if recipe is None:
         return AnalyticPilot()
@@ -91,20 +93,22 @@ def make_expert(recipe: ExpertRecipe | None, progress: Callable[[int, int], None
     return PolicyBank([policy for policy, _ in best], targets, card)
 
 
-def _run_searches(recipe: ExpertRecipe, progress: Callable[[int, int], None]) -> list[tuple[LinearPolicy, dict[str, Any]]]:
+def _run_searches(recipe: ExpertRecipe, progress: Callable[[int], object]) -> list[tuple[LinearPolicy, dict[str, Any]]]:
     """All searches in order: those of the first policy, then those of the next."""
     jobs = [(recipe, slot, number) for slot in range(max(1, len(recipe.targets))) for number in range(recipe.seeds)]
     # Spawned, not forked: a fork would copy whatever threads the caller's libraries run.
     context = multiprocessing.get_context("spawn")
-    done, total = context.Value("q", 0), len(jobs) * recipe.ars.iterations
+    done, told = context.Value("q", 0), 0
     with ProcessPoolExecutor(min(PROCESSES_MAX, len(jobs)), context, _start_worker, (done,)) as pool:
         futures = [pool.submit(_search_job, *job) for job in jobs]
         try:
             while (state := wait(futures, POLL_S, FIRST_EXCEPTION)).not_done and not any(f.exception() for f in state.done):
-                progress(done.value, total)
+                now = done.value
+                progress(now - told)
+                told = now
             return [future.result() for future in futures]
         finally:
-            progress(done.value, total)
+            progress(done.value - told)
             pool.shutdown(cancel_futures=True)
 
 
@@ -152,11 +156,11 @@ class _Course:
         }
 
     def _play(self, policy: LinearPolicy, seed: int, noise: float) -> tuple[float, np.ndarray]:
-        """One episode: its return and the features visited (200, features)."""
+        """One episode: its return and the features visited (steps, features)."""
         rng = np.random.default_rng([seed, 1])
         observation, _ = self.env.reset(seed=seed)
         visited, total = [], 0.0
-        for _ in range(environments.EPISODE_STEPS):
+        for _ in range(self.env.episode_steps):
             features = np.concatenate([observation, self.env.context]) if self.sees_context else observation
             action = policy.act(features)
             if noise:

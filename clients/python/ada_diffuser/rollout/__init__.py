@@ -8,7 +8,7 @@ with Client("grpc://127.0.0.1:7777") as client:
 print(result.mean_return, result.standard_error)
 """
 
-from ada_diffuser.rollout.episodes import evaluate
+from ada_diffuser.rollout.episodes import check, evaluate
 from ada_diffuser.rollout.result import ActLog, Episode, Evaluation, Trial
 
-__all__ = ["ActLog", "Episode", "Evaluation", "Trial", "evaluate"]
+__all__ = ["ActLog", "Episode", "Evaluation", "Trial", "check", "evaluate"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from typing import Any
 
 import gymnasium
@@ -14,7 +14,7 @@ from ada_diffuser import environments
 from ada_diffuser.broker import ChunkBroker
 from ada_diffuser.client import Client
 from ada_diffuser.errors import AdaError
-from ada_diffuser.messages import Chunk
+from ada_diffuser.messages import Chunk, Model
 from ada_diffuser.rollout.result import ActLog, Episode, Evaluation, Trial
 
 #: Called with the number of environment steps just made.
@@ -77,25 +77,38 @@ class _Lane:
         self.state = np.asarray(observation, np.float32)
         self.done = bool(terminated or truncated)
         if self.done:
-            failed = getattr(self.env.unwrapped, "failed", None)
-            self.episode.failed = bool(failed and failed(self.episode.total))
+            self.episode.failed = environments.failed(self.env, self.episode.total)
 
 
 def _open_lanes(client: Client, trial: Trial, stack: ExitStack) -> list[_Lane]:
     lanes = []
     for slot in range(min(trial.vector, trial.episodes)):
-        env = environments.make(trial.env)
+        env = environments.make(trial.env, episode_steps=trial.episode_steps)
         stack.callback(env.close)
         session = stack.enter_context(client.open_session(trial.model, seed=trial.seed + slot, options=trial.options))
-        wanted = (session.model.state_dim, session.model.action_dim)
-        offered = tuple(int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space))
-        if wanted != offered:
-            raise ValueError(
-                f"{trial.env} has {offered[0]} state and {offered[1]} action values, "
-                f"but model {session.model.name} has {wanted[0]} and {wanted[1]}"
-            )
+        _check_fit(trial.env, env, session.model)
         lanes.append(_Lane(env, ChunkBroker(session)))
     return lanes
+
+
+def check(client: Client, trial: Trial) -> int:
+    """What can be known before an episode is run: environment, model and options are there, and fit. Raises as `evaluate` does.
+
+    Returns the steps of an episode at most.
+    """
+    env = environments.make(trial.env, episode_steps=trial.episode_steps)
+    with closing(env), client.open_session(trial.model, seed=trial.seed, options=trial.options) as session:
+        _check_fit(trial.env, env, session.model)
+        return environments.steps_max(env)
+
+
+def _check_fit(name: str, env: gymnasium.Env[Any, Any], model: Model) -> None:
+    wanted = (model.state_dim, model.action_dim)
+    offered = (env.observation_space.shape[0], env.action_space.shape[0])
+    if wanted != offered:
+        raise ValueError(
+            f"{name} has {offered[0]} state and {offered[1]} action values, but model {model.name} has {wanted[0]} and {wanted[1]}"
+        )
 
 
 def _run(client: Client, trial: Trial, lanes: list[_Lane], acts: ActLog, progress: Progress) -> None:

@@ -25,8 +25,6 @@ from ada_diffuser.rollout.result import Episode
 BYTES_MAX = 6_000_000
 WIDTH = 360
 FRAME_MS = 50
-#: Half the side of the square that a point mass is drawn in.
-POINT_WORLD = 1.5
 
 
 def save_film(env: str, episode: Episode, readout: Readout | str, path: Path) -> str | None:
@@ -39,7 +37,6 @@ def save_film(env: str, episode: Episode, readout: Readout | str, path: Path) ->
             env=env,
             seed=episode.seed,
             actions=np.array(episode.actions),
-            states=np.array(episode.states),
             rewards=np.array(episode.rewards),
             contexts=np.array(episode.contexts),
             act_steps=np.array(episode.act_steps),
@@ -73,10 +70,9 @@ def _render_apart(recorded: Path, path: Path, backend: str) -> str | None:
 
 
 def _frames(record: dict[str, NDArray[np.float32]]) -> Iterator[Image.Image]:
-    if str(record["env"]) in ("point-wind-s", environments.NAMES["point-wind-s"]):
-        yield from _point_frames(record)
-        return
-    env = environments.make(str(record["env"]), render_mode="rgb_array")
+    env = environments.make(str(record["env"]), episode_steps=len(record["actions"]), render_mode="rgb_array")
+    if "rgb_array" not in env.metadata.get("render_modes", ()):
+        raise ValueError(f"{record['env']} cannot draw itself: rgb_array is none of its render modes")
     env.reset(seed=int(record["seed"]))
     for step, action in enumerate(record["actions"]):
         frame = Image.fromarray(np.asarray(env.render(), np.uint8))
@@ -84,29 +80,6 @@ def _frames(record: dict[str, NDArray[np.float32]]) -> Iterator[Image.Image]:
         yield _captioned(frame, record, step)
         env.step(action)
     env.close()
-
-
-def _point_frames(record: dict[str, NDArray[np.float32]]) -> Iterator[Image.Image]:
-    """The mass as a dot with its trail, the goal as a cross, the wind as an arrow."""
-
-    def pixel(at: NDArray[np.float32]) -> tuple[float, float]:
-        x, y = np.clip(at[:2], -POINT_WORLD, POINT_WORLD) / POINT_WORLD
-        return (1 + float(x)) * WIDTH / 2, (1 - float(y)) * WIDTH / 2
-
-    centre = WIDTH / 2
-    for step in range(len(record["states"])):
-        frame = Image.new("RGB", (WIDTH, WIDTH), "white")
-        draw = ImageDraw.Draw(frame)
-        draw.line((centre - 6, centre, centre + 6, centre), fill="gray")
-        draw.line((centre, centre - 6, centre, centre + 6), fill="gray")
-        trail = [pixel(past) for past in record["states"][max(0, step - 25) : step + 1]]
-        if len(trail) > 1:
-            draw.line(trail, fill=(160, 190, 230), width=2)
-        x, y = trail[-1]
-        wind_x, wind_y = record["contexts"][step] * 12
-        draw.line((x, y, x + wind_x, y - wind_y), fill=(200, 60, 40), width=2)
-        draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=(30, 90, 180))
-        yield _captioned(frame, record, step)
 
 
 def _captioned(frame: Image.Image, record: dict[str, NDArray[np.float32]], step: int) -> Image.Image:
