@@ -17,7 +17,7 @@ const PLAN_HORIZON_MAX: usize = 1024;
 /// Real steps that a network looks back on.
 const HISTORY_MAX: usize = 4096;
 /// Diffusion levels; each costs memory in every loaded model.
-const LEVEL_MAX_MAX: usize = 65_536;
+const LEVEL_MAX_MAX: usize = 1 << 20;
 /// State or action columns; `config.json` lists several numbers for each.
 const COLUMNS_MAX: usize = 4096;
 /// Channels of one layer.
