@@ -7,14 +7,19 @@ What is sent again: an act, a batch, a reset, a close or a question that failed 
 `Unavailable`, after a wait (`RetryPolicy`). An act is sent again with the same step and the same bytes, so the server either
 takes it once or answers as it did before (`Chunk.replayed`). If all attempts fail, the last error is raised and the
 session stands where it stood: call `act` with the same observation again, whenever you like.
+
+Processes: clients and sessions may be made before a fork, pickled and copied. A client has connections of its own in each
+process; a session goes on in the other one from the step where it stood, and only one of the two may go on with it.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,14 +41,30 @@ from ada_diffuser.retry import Backoff, RetryPolicy
 
 
 class Client:
-    """A server. Safe to use from many threads; a `Session` belongs to one thread at a time."""
+    """A server. Safe to use from many threads and after a fork; a `Session` belongs to one thread of one process at a time.
+
+    It pickles and copies as its settings: the copy has connections of its own.
+    """
 
     def __init__(self, url: str, *, timeout_s: float = 30.0, retry: RetryPolicy | None = None) -> None:
         """`url` is `grpc://host:port` or `http://host:port`; `timeout_s` bounds each attempt of each call."""
         self.url = url
         self._timeout_s = timeout_s
         self._retry = retry or RetryPolicy()
-        self._face: Face = connect(url)
+        self._closed = False
+        # By process: what was connected before a fork belongs to the parent. Here it is neither used nor closed.
+        self._faces: dict[int, Face] = {os.getpid(): connect(url)}
+
+    @property
+    def _face(self) -> Face:
+        """The connections of this process."""
+        if self._closed:
+            raise RuntimeError("this client was closed: make a new one")
+        process = os.getpid()
+        return self._faces.get(process) or self._faces.setdefault(process, connect(self.url))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_faces": {}}
 
     def __enter__(self) -> Client:
         return self
@@ -52,8 +73,11 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Closes the connections. Sessions that are still open expire on the server."""
-        self._face.close()
+        """Closes the connections of this process. Sessions that are still open expire on the server."""
+        self._closed = True
+        face = self._faces.pop(os.getpid(), None)
+        if face is not None:
+            face.close()
 
     def wait_ready(self, timeout_s: float = 60.0) -> None:
         """Returns when the server answers with at least one model; Unavailable if it does not within `timeout_s`."""
@@ -93,12 +117,12 @@ class Client:
         """
         wanted = options or SamplerOptions()
         summary, spec = self._retry.run(lambda: self._face.open_session(model, seed, wanted, ttl_ms, self._timeout_s))
-        return Session(self, self._face, summary, spec)
+        return Session(self, summary, spec)
 
     def attach(self, session_id: str) -> Session:
         """A session that was opened elsewhere, or before this program was started again."""
         summary = self.summary(session_id)
-        return Session(self, self._face, summary, self.model(f"{summary.model}@{summary.model_digest}"))
+        return Session(self, summary, self.model(f"{summary.model}@{summary.model_digest}"))
 
     def summary(self, session_id: str) -> SessionSummary:
         """The state of a session."""
@@ -166,9 +190,12 @@ class Client:
 
 
 class Session:
-    """One episode after the other, on one model. A context manager that closes the session."""
+    """One episode after the other, on one model. A context manager that closes the session.
 
-    def __init__(self, client: Client, face: Face, summary: SessionSummary, model: Model) -> None:
+    It pickles and copies as its id, its client's settings and the step where it stands; the copy goes on from there.
+    """
+
+    def __init__(self, client: Client, summary: SessionSummary, model: Model) -> None:
         """Made by `Client.open_session` and `Client.attach`."""
         self._client = client
         self.session_id = summary.session_id

@@ -12,8 +12,10 @@ from ada_diffuser.errors import AdaError, Detail, UnexpectedAnswer, from_detail
 from ada_diffuser.messages import ActCall, Chunk, Floats, Model, SamplerOptions, SessionSummary, Start, Timings
 from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
 
-#: gRPC must not retry by itself (the client does), and must find a restarted server again within seconds.
+#: gRPC must not retry by itself (the client does), and must find a restarted server again within seconds. Channels must not
+#: share connections: after a fork a new channel would be given the parent's.
 _CHANNEL_OPTIONS = [
+    ("grpc.use_local_subchannel_pool", 1),
     ("grpc.enable_retries", 0),
     ("grpc.max_receive_message_length", 64 << 20),
     ("grpc.initial_reconnect_backoff_ms", 100),

@@ -25,6 +25,7 @@ class HttpFace:
     def __init__(self, host: str, port: int) -> None:
         self._host, self._port = host, port
         self._idle: list[http.client.HTTPConnection] = []
+        self._closed = False
         self._lock = threading.Lock()
 
     def open_session(
@@ -73,6 +74,7 @@ class HttpFace:
 
     def close(self) -> None:
         with self._lock:
+            self._closed = True
             idle, self._idle = self._idle, []
         for connection in idle:
             connection.close()
@@ -118,11 +120,12 @@ class HttpFace:
         except (OSError, http.client.HTTPException) as error:
             connection.close()
             raise Unavailable(f"{self._host}:{self._port}: {error or type(error).__name__}") from None
-        if response.will_close:
-            connection.close()
-        else:
-            with self._lock:
+        with self._lock:
+            kept = not (response.will_close or self._closed)
+            if kept:
                 self._idle.append(connection)
+        if not kept:
+            connection.close()
         return response.status, response.headers, text
 
     def _take(self) -> http.client.HTTPConnection:
