@@ -6,7 +6,6 @@ The binary is `$ADA_SERVER`, else `target/release/ada-server`. Without one these
 from __future__ import annotations
 
 import json
-import shutil
 import socket
 import threading
 from collections.abc import Iterator
@@ -16,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from server import ROOT, running
 
 from ada_diffuser import (
     Chunk,
@@ -39,15 +37,6 @@ from ada_diffuser.rollout import Trial, evaluate
 
 FACES = ("grpc", "http")
 STATES = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 4)).astype(np.float32)
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """`host:port` of a server that runs for this module, and must end by itself when told to."""
-    folder = tmp_path_factory.mktemp("server")
-    shutil.copytree(ROOT / "models/tiny", folder / "models/tiny")
-    with running(folder / "log", "--models", str(folder / "models"), "--default-model", "tiny") as address:
-        yield address
 
 
 @pytest.fixture(params=FACES)

@@ -6,27 +6,15 @@ import copy
 import gc
 import multiprocessing
 import pickle
-import shutil
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from server import ROOT, running
 
 from ada_diffuser import ChunkBroker, Client, NotFound, Session
 
 WORKERS = 4
 ROUNDS = 8
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """`host:port` of a server that runs for this module."""
-    folder = tmp_path_factory.mktemp("server")
-    shutil.copytree(ROOT / "models/tiny", folder / "models/tiny")
-    with running(folder / "log", "--models", str(folder / "models"), "--default-model", "tiny") as address:
-        yield address
 
 
 @pytest.fixture(params=["grpc", "http"])

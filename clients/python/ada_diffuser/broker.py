@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ada_diffuser.client import Session
-from ada_diffuser.messages import Chunk, Executed, Floats, Observation, finite
+from ada_diffuser.messages import Chunk, Executed, Observation
+from ada_diffuser.values import Floats, number, vector
 
 
 class ChunkBroker:
@@ -65,13 +66,13 @@ class ChunkBroker:
         self._next += 1
         return action.copy()
 
-    def report(self, *, reward: float | None = None, action: ArrayLike | None = None) -> None:
+    def report(self, *, reward: ArrayLike | None = None, action: ArrayLike | None = None) -> None:
         """What became of the action handed out last: its reward, and the action itself where another one was executed."""
         if not self._executed:
             raise RuntimeError("no action was handed out since the last act")
         last = self._executed[-1]
-        done = last.action if action is None else finite(action, "action").copy()
-        self._executed[-1] = Executed(last.state, done, last.reward if reward is None else float(reward))
+        done = last.action if action is None else vector(action, "action")
+        self._executed[-1] = Executed(last.state, done, last.reward if reward is None else number(reward, "reward"))
 
     def replan(self) -> None:
         """Drops the rest of the chunk, or all of it: the next action comes from a new act, which is told what was executed."""

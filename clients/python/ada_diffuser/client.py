@@ -21,7 +21,6 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from ada_diffuser.errors import AdaError, InvalidInput, NotFound, StepConflict, Unavailable
@@ -35,9 +34,9 @@ from ada_diffuser.messages import (
     SamplerOptions,
     SessionSummary,
     executed_values,
-    finite,
 )
 from ada_diffuser.retry import Backoff, RetryPolicy
+from ada_diffuser.values import column, flag, invalid, text, vector, whole
 
 
 class Client:
@@ -99,13 +98,14 @@ class Client:
         """All loaded models, by name."""
         return self._retry.run(lambda: self._face.models(self._timeout_s))
 
-    def model(self, name: str = "") -> Model:
+    def model(self, name: str | None = "") -> Model:
         """One model, `name` or `name@digest`; empty: the default one."""
+        name = _model_name(name)
         return self._retry.run(lambda: self._face.model(name, self._timeout_s))
 
     def open_session(
         self,
-        model: str = "",
+        model: str | None = "",
         *,
         seed: int | None = None,
         options: SamplerOptions | None = None,
@@ -115,8 +115,9 @@ class Client:
 
         If an answer is lost on the way, the retry opens a second session and the first one expires unused.
         """
-        wanted = options or SamplerOptions()
-        summary, spec = self._retry.run(lambda: self._face.open_session(model, seed, wanted, ttl_ms, self._timeout_s))
+        name, wanted = _model_name(model), _options(options)
+        seed, ttl_ms = _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
+        summary, spec = self._retry.run(lambda: self._face.open_session(name, seed, wanted, ttl_ms, self._timeout_s))
         return Session(self, summary, spec)
 
     def attach(self, session_id: str) -> Session:
@@ -126,14 +127,15 @@ class Client:
 
     def summary(self, session_id: str) -> SessionSummary:
         """The state of a session."""
+        session_id = _session_id(session_id)
         return self._retry.run(lambda: self._face.get_session(session_id, self._timeout_s))
 
-    def sessions(self, model: str = "", page_size: int = 0) -> Iterator[SessionSummary]:
+    def sessions(self, model: str | None = "", page_size: int = 0) -> Iterator[SessionSummary]:
         """All sessions, by id; page after page as they are consumed."""
-        token = ""
+        name, size, token = _model_name(model), whole(page_size, "page_size", bits=32), ""
         while True:
             page, token = self._retry.run(
-                lambda token=token: self._face.list_sessions(model, page_size, token, self._timeout_s)  # type: ignore[misc]
+                lambda token=token: self._face.list_sessions(name, size, token, self._timeout_s)  # type: ignore[misc]
             )
             yield from page
             if not token:
@@ -177,6 +179,7 @@ class Client:
         return self._retry.run(lambda: self._face.act(call, self._timeout_s))
 
     def _reset(self, session_id: str, seed: int | None, keep_history: bool) -> SessionSummary:
+        seed, keep_history = _whole_if_given(seed, "seed"), flag(keep_history, "keep_history")
         # An act that was given up here may still be in flight there, for a moment: worth the wait.
         return self._retry.run(
             lambda: self._face.reset_session(session_id, seed, keep_history, self._timeout_s),
@@ -187,6 +190,28 @@ class Client:
         # Not found: a close whose answer was lost, or the session expired. It is closed either way.
         with suppress(NotFound):
             self._retry.run(lambda: self._face.close_session(session_id, self._timeout_s))
+
+
+def _model_name(name: str | None) -> str:
+    return "" if name is None else text(name, "model")
+
+
+def _session_id(session_id: str) -> str:
+    if not text(session_id, "session_id"):
+        raise invalid("session_id", "is empty")
+    return session_id
+
+
+def _options(options: SamplerOptions | None) -> SamplerOptions:
+    if options is None:
+        return SamplerOptions()
+    if not isinstance(options, SamplerOptions):
+        raise invalid("options", f"is no SamplerOptions, but a {type(options).__name__}")
+    return options.checked()
+
+
+def _whole_if_given(value: int | None, field: str, bits: int = 64) -> int | None:
+    return None if value is None else whole(value, field, bits)
 
 
 class Session:
@@ -228,7 +253,7 @@ class Session:
         state: ArrayLike,
         executed: Sequence[Executed] = (),
         *,
-        reward: float | Sequence[float] | None = None,
+        reward: ArrayLike | None = None,
         nothing_executed: bool = False,
         deadline_ms: int | None = None,
         planned_states: bool = False,
@@ -240,9 +265,9 @@ class Session:
         `nothing_executed` plans anew in the place of the last act: none of its actions was executed, and no time has passed.
         """
         if reward is not None:
-            if executed:
+            if len(executed):
                 raise ValueError("rewards stand in `executed` when it is given")
-            executed = [Executed(reward=float(value)) for value in np.atleast_1d(np.asarray(reward, dtype=float))]
+            executed = [Executed(reward=value) for value in column(reward, "observation.reward")]
         call = self.next_call(Observation(state, executed, nothing_executed), deadline_ms, planned_states)
         chunk = self._client._act(call)
         self.commit(chunk)
@@ -253,11 +278,11 @@ class Session:
         return ActCall(
             session_id=self.session_id,
             step=self._committed_step + 1,
-            state=finite(observation.state, "observation.state"),
+            state=vector(observation.state, "observation.state"),
             executed=executed_values(observation.executed),
-            nothing_executed=observation.nothing_executed,
-            deadline_ms=deadline_ms,
-            want_planned_states=planned_states,
+            nothing_executed=flag(observation.nothing_executed, "observation.nothing_executed"),
+            deadline_ms=_whole_if_given(deadline_ms, "deadline_ms", bits=32),
+            want_planned_states=flag(planned_states, "want_planned_states"),
         )
 
     def commit(self, chunk: Chunk) -> None:

@@ -5,16 +5,15 @@ Values are in the units of the data set and travel as float32.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ada_diffuser.errors import Detail, InvalidInput
+from ada_diffuser.values import Floats, flag, invalid, number, text, vector, whole
 
-Floats = NDArray[np.float32]
 LatentMode = Literal["mean", "sample"]
 Start = Literal["cold", "warm", "renoised"]
 
@@ -57,6 +56,10 @@ class SamplerOptions:
         pairs = ((item.name, getattr(self, item.name)) for item in fields(self))
         return {name: value for name, value in pairs if value is not None}
 
+    def checked(self) -> SamplerOptions:
+        """With plain numbers and flags, as they travel; InvalidInput names the wrong one."""
+        return replace(self, **{name: _CHECKS[name](value, f"options.{name}") for name, value in self.given().items()})
+
 
 def _flag(word: str) -> bool:
     if word.lower() not in ("true", "false"):
@@ -81,6 +84,23 @@ _PARSERS: dict[str, Any] = {
 }
 
 
+def _checked_mode(value: Any, field: str) -> str:
+    if text(value, field) not in ("mean", "sample"):
+        raise invalid(field, f"{value!r} is neither mean nor sample")
+    return str(value)
+
+
+_CHECKS: dict[str, Callable[[Any, str], Any]] = {
+    "streaming": flag,
+    "action_horizon": partial(whole, bits=32),
+    "sub_steps": partial(whole, bits=32),
+    "eta": number,
+    "temperature": number,
+    "kappa": partial(number, infinity=True),
+    "latent": _checked_mode,
+}
+
+
 @dataclass(frozen=True, eq=False)
 class Executed:
     """One executed step; what is None is unknown, and masked."""
@@ -89,8 +109,8 @@ class Executed:
     state: ArrayLike | None = None
     #: The action, `(action_dim,)`; None: the one that was returned for this step.
     action: ArrayLike | None = None
-    #: The reward that followed.
-    reward: float | None = None
+    #: The reward that followed: a number, or an array of one.
+    reward: ArrayLike | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,34 +148,16 @@ class ActCall:
     want_planned_states: bool = False
 
 
-def finite(values: ArrayLike, field: str) -> Floats:
-    """As a float32 vector; InvalidInput naming `field` if it is no vector or not finite. JSON could not spell NaN."""
-    try:
-        with np.errstate(over="ignore"):
-            vector = np.asarray(values, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        raise InvalidInput(Detail(f"is no vector of numbers ({error})", "OBSERVATION_INVALID", field)) from None
-    if vector.ndim != 1:
-        raise InvalidInput(Detail(f"has {vector.ndim} dimensions instead of 1", "OBSERVATION_INVALID", field))
-    (bad,) = np.nonzero(~np.isfinite(vector))
-    if bad.size:
-        raise InvalidInput(Detail("is not a finite number", "OBSERVATION_INVALID", f"{field}[{bad[0]}]"))
-    return vector
-
-
 def executed_values(executed: Sequence[Executed]) -> tuple[ExecutedValues, ...]:
     """The executed steps of an observation, checked."""
     values = []
     for i, step in enumerate(executed):
         path = f"observation.executed[{i}]"
-        state = None if step.state is None else finite(step.state, f"{path}.state")
-        action = None if step.action is None else finite(step.action, f"{path}.action")
-        reward = None
-        if step.reward is not None:
-            with np.errstate(over="ignore"):
-                reward = float(np.float32(step.reward))
-            if not np.isfinite(reward):
-                raise InvalidInput(Detail("is not a finite number", "OBSERVATION_INVALID", f"{path}.reward"))
+        if not isinstance(step, Executed):
+            raise invalid(path, f"is no Executed, but a {type(step).__name__}")
+        state = None if step.state is None else vector(step.state, f"{path}.state")
+        action = None if step.action is None else vector(step.action, f"{path}.action")
+        reward = None if step.reward is None else number(step.reward, f"{path}.reward")
         values.append(ExecutedValues(state, action, reward))
     return tuple(values)
 

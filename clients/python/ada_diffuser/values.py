@@ -1,7 +1,7 @@
-"""What callers hand over as a number, a flag, a text or a vector: checked here, once, before either face spells it.
+"""What callers hand over, as it travels: checked once, before either face, so that both take and refuse the same.
 
-numpy scalars and arrays of one element count as the number they hold. What the wire cannot carry is `InvalidInput` with the
-name of the field, the same on both faces; whether a number is a good one is the server's business.
+numpy scalars and arrays of one element are numbers here. What is refused raises `InvalidInput` with the name of the field and
+the reason that the server gives for such a field.
 """
 
 from __future__ import annotations
@@ -16,99 +16,97 @@ from ada_diffuser.errors import Detail, InvalidInput
 
 Floats = NDArray[np.float32]
 
-UINT32_MAX = 2**32 - 1
-UINT64_MAX = 2**64 - 1
-#: Longer than any call takes, and short enough for every clock below.
-SECONDS_MAX = 1e6
 
-
-def invalid(field: str, message: str) -> InvalidInput:
-    """The error of a wrong value; what kind of thing is wrong is said by the beginning of its path, as on the server."""
-    kinds = {"observation": "OBSERVATION_INVALID", "options": "OPTIONS_INVALID"}
-    return InvalidInput(Detail(message, kinds.get(field.split(".")[0], "REQUEST_INVALID"), field))
-
-
-def whole(value: Any, field: str, high: int = UINT64_MAX) -> int:
-    """A whole number in 0 .. `high`."""
-    plain = _scalar(value, field)
-    if isinstance(plain, bool) or (isinstance(plain, float) and not plain.is_integer()):
-        raise invalid(field, f"{plain!r} is not a whole number")
-    if not 0 <= plain <= high:
-        raise invalid(field, f"{plain!r} is not in 0 .. {high}")
-    return int(plain)
-
-
-def number(value: Any, field: str, *, infinity: bool = False) -> float:
-    """A number that is finite as float32, rounded to one; `infinity` allows that too (not its negative)."""
-    plain = _scalar(value, field)
-    if infinity and plain == np.inf:
-        return float(plain)
-    try:
-        with np.errstate(over="ignore"):
-            single = float(np.float32(plain))
-    except OverflowError:
-        single = np.inf
-    if not np.isfinite(single):
-        raise invalid(field, "is not a finite number")
-    return single
-
-
-def seconds(value: Any, field: str) -> float:
-    """A time that can be waited for."""
-    plain = _scalar(value, field)
-    if not 0 < plain <= SECONDS_MAX:
-        raise invalid(field, f"{plain!r} s is not between 0 and {SECONDS_MAX:g} s")
-    return float(plain)
-
-
-def flag(value: Any, field: str) -> bool:
-    """True or False, or the numbers 1 and 0."""
-    plain = _scalar(value, field)
-    if plain not in (0, 1):
-        raise invalid(field, f"{plain!r} is neither True nor False")
-    return bool(plain)
-
-
-def text(value: Any, field: str) -> str:
-    """A string that can be sent."""
-    if not isinstance(value, str):
-        raise invalid(field, f"{reprlib.repr(value)} is not a string")
-    if any("\ud800" <= letter <= "\udfff" for letter in value):
-        raise invalid(field, f"{value!r} holds half a character")
-    return value
+def invalid(field: str, why: str) -> InvalidInput:
+    """The error of a wrong `field`."""
+    reasons = {"observation": "OBSERVATION_INVALID", "options": "OPTIONS_INVALID"}
+    return InvalidInput(Detail(why, reasons.get(field.split(".")[0], "REQUEST_INVALID"), field))
 
 
 def vector(values: ArrayLike, field: str) -> Floats:
-    """A copy as a float32 vector of finite numbers."""
-    try:
-        array = np.asarray(values)
-        if array.dtype.kind not in "biufO":
-            raise TypeError(f"{array.dtype} is not a type of numbers")
-        with np.errstate(over="ignore"):
-            copy: Floats = array.astype(np.float32)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise invalid(field, f"is no vector of numbers ({error})") from None
-    if copy.ndim != 1:
-        raise invalid(field, f"has shape {copy.shape}, which is no vector")
-    (bad,) = np.nonzero(~np.isfinite(copy) | np.ma.getmaskarray(np.ma.asanyarray(values)))
+    """A float32 vector, `(n,)`, all finite: JSON could not spell NaN."""
+    numbers = _float32(_numbers(values, field), field)
+    if numbers.ndim != 1:
+        raise invalid(field, f"has {numbers.ndim} dimensions instead of 1")
+    (bad,) = np.nonzero(~np.isfinite(numbers))
     if bad.size:
         raise invalid(f"{field}[{bad[0]}]", "is not a finite number")
-    return copy
+    return numbers
 
 
-def _scalar(value: Any, field: str) -> bool | int | float:
-    """The one plain value that a number or an array of one element holds."""
-    if type(value) in (bool, int, float):
-        plain: bool | int | float = value
-        return plain
+def column(values: ArrayLike, field: str) -> NDArray[Any]:
+    """Numbers one below the other, `(n,)`: one alone, a vector, or a matrix of one column."""
+    numbers = np.atleast_1d(_numbers(values, field))
+    if numbers.size != len(numbers):
+        raise invalid(field, f"is of shape {numbers.shape}: one number, or a vector of them, is expected")
+    return numbers.reshape(-1)
+
+
+def number(value: Any, field: str, *, infinity: bool = False) -> float:
+    """A number that float32 can hold, rounded to it; infinite only if `infinity` allows it."""
+    given = _single(_numbers(value, field), field)
+    one = float(_float32(given, field))
+    if not (np.isfinite(one) or (infinity and one == float(given) == np.inf)):
+        raise invalid(field, "is not a finite number")
+    return one
+
+
+def whole(value: Any, field: str, bits: int = 64) -> int:
+    """A whole number in `0 .. 2^bits - 1`. 7.0 and True are none."""
+    one = _single(_array(value, field), field).item()
+    if not isinstance(one, int) or isinstance(one, bool):
+        raise invalid(field, f"{reprlib.repr(value)} is no whole number")
+    if not 0 <= one < 1 << bits:
+        raise invalid(field, f"{one} is not in 0 .. 2^{bits} - 1")
+    return one
+
+
+def flag(value: Any, field: str) -> bool:
+    """True or False; 0 and 1 are neither."""
+    one = _single(_array(value, field), field).item()
+    if not isinstance(one, bool):
+        raise invalid(field, f"{reprlib.repr(value)} is neither True nor False")
+    return one
+
+
+def text(value: Any, field: str) -> str:
+    """A text that UTF-8 can spell."""
+    if not isinstance(value, str):
+        raise invalid(field, f"{reprlib.repr(value)} is no text")
     try:
-        array = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        raise invalid(field, f"{reprlib.repr(value)} is not a number") from None
+        value.encode()
+    except UnicodeEncodeError:
+        raise invalid(field, f"{value!r} is not valid Unicode") from None
+    return str(value)
+
+
+def _array(values: Any, field: str) -> NDArray[Any]:
+    """As numpy sees it, but for masks, which it would drop in silence."""
+    if np.ma.is_masked(values):
+        raise invalid(field, "has masked values: fill them first")
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise invalid(field, f"is no array of numbers ({error})") from None
+
+
+def _numbers(values: Any, field: str) -> NDArray[Any]:
+    """What may be numbers: texts, dates and imaginary parts are not made some in silence."""
+    array = _array(values, field)
+    if array.dtype.kind in "cUSMm":
+        raise invalid(field, f"{reprlib.repr(values)} holds values of type {array.dtype.name} instead of numbers")
+    return array
+
+
+def _single(array: NDArray[Any], field: str) -> NDArray[Any]:
     if array.size != 1:
-        raise invalid(field, f"has shape {array.shape}: one number belongs here")
-    held = array.reshape(-1)[0]
-    held = held.item() if isinstance(held, np.generic) else held
-    if np.ma.is_masked(value) or not isinstance(held, (bool, int, float, np.floating)):
-        raise invalid(field, f"{reprlib.repr(value)} is not a number")
-    return float(held) if isinstance(held, np.floating) else held
+        raise invalid(field, f"is of shape {array.shape}: one value is expected")
+    return array.reshape(())
+
+
+def _float32(array: NDArray[Any], field: str) -> Floats:
+    try:
+        with np.errstate(over="ignore"):
+            return array.astype(np.float32)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise invalid(field, f"is no array of numbers ({error})") from None

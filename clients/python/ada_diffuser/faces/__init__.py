@@ -1,6 +1,6 @@
 """The two faces of the server, behind one protocol: every verb once, plain data in and out, `AdaError` on failure.
 
-A face makes exactly one attempt a call; retrying is the client's business.
+A face makes exactly one attempt a call, with values that are checked already; both are the client's business.
 """
 
 from __future__ import annotations

@@ -9,8 +9,9 @@ import grpc
 import numpy as np
 
 from ada_diffuser.errors import AdaError, Detail, UnexpectedAnswer, from_detail
-from ada_diffuser.messages import ActCall, Chunk, Floats, Model, SamplerOptions, SessionSummary, Start, Timings
+from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary, Start, Timings
 from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
+from ada_diffuser.values import Floats
 
 #: gRPC must not retry by itself (the client does), and must find a restarted server again within seconds. Channels must not
 #: share connections: after a fork a new channel would be given the parent's.
@@ -41,9 +42,7 @@ class GrpcFace:
     def open_session(
         self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, timeout_s: float
     ) -> tuple[SessionSummary, Model]:
-        request = agent_pb2.OpenSessionRequest(
-            model=model, seed=_uint64(seed, "seed"), options=_options_out(options), ttl_ms=_uint64(ttl_ms, "ttl_ms")
-        )
+        request = agent_pb2.OpenSessionRequest(model=model, seed=seed, options=_options_out(options), ttl_ms=ttl_ms)
         answer = _call(self._agent.OpenSession, request, timeout_s)
         return _summary(answer.session), _model(answer.model)
 
@@ -55,7 +54,7 @@ class GrpcFace:
         return [_result(result) for result in _call(self._agent.ActBatch, request, timeout_s).results]
 
     def reset_session(self, session_id: str, seed: int | None, keep_history: bool, timeout_s: float) -> SessionSummary:
-        request = agent_pb2.ResetSessionRequest(session_id=session_id, seed=_uint64(seed, "seed"), keep_history=keep_history)
+        request = agent_pb2.ResetSessionRequest(session_id=session_id, seed=seed, keep_history=keep_history)
         return _summary(_call(self._agent.ResetSession, request, timeout_s).session)
 
     def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:
@@ -118,12 +117,6 @@ def _error_of_result(error: agent_pb2.Error) -> AdaError:
         error_id=error.error_id,
     )
     return from_detail(detail, grpc_code=error.code)
-
-
-def _uint64(value: int | None, field: str) -> int | None:
-    if value is not None and not 0 <= value < 1 << 64:
-        raise ValueError(f"{field} = {value} is not in 0 .. 2^64 - 1")
-    return value
 
 
 def _act_request(call: ActCall) -> agent_pb2.ActRequest:

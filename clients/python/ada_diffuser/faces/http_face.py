@@ -14,7 +14,8 @@ from urllib.parse import quote, urlencode
 import numpy as np
 
 from ada_diffuser.errors import AdaError, DeadlineExceeded, Detail, Unavailable, UnexpectedAnswer, from_detail
-from ada_diffuser.messages import ActCall, Chunk, Floats, Model, SamplerOptions, SessionSummary, Timings
+from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary, Timings
+from ada_diffuser.values import Floats
 
 T = TypeVar("T")
 
