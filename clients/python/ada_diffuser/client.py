@@ -38,6 +38,9 @@ from ada_diffuser.messages import (
 from ada_diffuser.retry import Backoff, RetryPolicy
 from ada_diffuser.values import column, flag, invalid, text, vector, whole
 
+#: Longer than anybody waits, and short enough for every clock below.
+_TIMEOUT_S_MAX = 1e8
+
 
 class Client:
     """A server. Safe to use from many threads and after a fork; a `Session` belongs to one thread of one process at a time.
@@ -46,9 +49,15 @@ class Client:
     """
 
     def __init__(self, url: str, *, timeout_s: float = 30.0, retry: RetryPolicy | None = None) -> None:
-        """`url` is `grpc://host:port` or `http://host:port`; `timeout_s` bounds each attempt of each call."""
+        """`url` is `grpc://host:port` or `http://host:port`; `timeout_s` bounds each attempt of each call, alike on both faces.
+
+        It is when this side hangs up: the server is not told to hurry, and an act never comes out coarser for it. That is what the
+        `deadline_ms` of an act asks for.
+        """
         self.url = url
-        self._timeout_s = timeout_s
+        self._timeout_s = float(timeout_s)
+        if not 0 < self._timeout_s <= _TIMEOUT_S_MAX:
+            raise ValueError(f"timeout_s = {timeout_s} is no number of seconds above 0, up to {_TIMEOUT_S_MAX:g}")
         self._retry = retry or RetryPolicy()
         self._closed = False
         # By process: what was connected before a fork belongs to the parent. Here it is neither used nor closed.

@@ -14,7 +14,7 @@ from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, Session
 
 
 class Face(Protocol):
-    """The verbs. `timeout_s` bounds each call on this side."""
+    """The verbs. `timeout_s` bounds each call on this side, from the connecting to the last byte of the answer."""
 
     def open_session(
         self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, timeout_s: float
@@ -48,8 +48,9 @@ def connect(url: str) -> Face:
         raise ValueError(f"{url!r} has more than a host and a port")
     if parts.scheme == "grpc":
         from ada_diffuser.faces.grpc_face import GrpcFace
+        from ada_diffuser.faces.proxy import proxy_to
 
-        return GrpcFace(parts.netloc)
+        return GrpcFace(parts.netloc, proxy_to(parts.hostname))
     from ada_diffuser.faces.http_face import HttpFace
 
     return HttpFace(parts.hostname, parts.port)

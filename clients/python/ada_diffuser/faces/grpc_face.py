@@ -8,7 +8,8 @@ from typing import Any, cast
 import grpc
 import numpy as np
 
-from ada_diffuser.errors import AdaError, Detail, UnexpectedAnswer, from_detail
+from ada_diffuser.errors import AdaError, Cancelled, Detail, UnexpectedAnswer, from_detail
+from ada_diffuser.faces.proxy import Proxy
 from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary, Start, Timings
 from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
 from ada_diffuser.values import Floats
@@ -20,7 +21,6 @@ _CHANNEL_OPTIONS = [
     ("grpc.enable_retries", 0),
     ("grpc.max_receive_message_length", 64 << 20),
     ("grpc.initial_reconnect_backoff_ms", 100),
-    ("grpc.min_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 2000),
 ]
 
@@ -34,8 +34,10 @@ _STARTS: dict[int, Start] = {
 class GrpcFace:
     """One channel; safe to use from many threads."""
 
-    def __init__(self, target: str) -> None:
-        self._channel = grpc.insecure_channel(target, options=_CHANNEL_OPTIONS)
+    def __init__(self, target: str, proxy: Proxy | None = None) -> None:
+        self._proxy = proxy
+        options = [*_CHANNEL_OPTIONS, ("grpc.enable_http_proxy", int(proxy is not None))]
+        self._channel = grpc.insecure_channel(target, options=options)
         self._agent = agent_pb2_grpc.AgentStub(self._channel)  # type: ignore[no-untyped-call]
         self._models = models_pb2_grpc.ModelsStub(self._channel)  # type: ignore[no-untyped-call]
 
@@ -43,58 +45,59 @@ class GrpcFace:
         self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, timeout_s: float
     ) -> tuple[SessionSummary, Model]:
         request = agent_pb2.OpenSessionRequest(model=model, seed=seed, options=_options_out(options), ttl_ms=ttl_ms)
-        answer = _call(self._agent.OpenSession, request, timeout_s)
+        answer = self._call(self._agent.OpenSession, request, timeout_s)
         return _summary(answer.session), _model(answer.model)
 
     def act(self, call: ActCall, timeout_s: float) -> Chunk:
-        return _chunk(_call(self._agent.Act, _act_request(call), timeout_s))
+        return _chunk(self._call(self._agent.Act, _act_request(call), timeout_s))
 
     def act_batch(self, calls: Sequence[ActCall], timeout_s: float) -> list[Chunk | AdaError]:
         request = agent_pb2.ActBatchRequest(acts=[_act_request(call) for call in calls])
-        return [_result(result) for result in _call(self._agent.ActBatch, request, timeout_s).results]
+        return [_result(result) for result in self._call(self._agent.ActBatch, request, timeout_s).results]
 
     def reset_session(self, session_id: str, seed: int | None, keep_history: bool, timeout_s: float) -> SessionSummary:
         request = agent_pb2.ResetSessionRequest(session_id=session_id, seed=seed, keep_history=keep_history)
-        return _summary(_call(self._agent.ResetSession, request, timeout_s).session)
+        return _summary(self._call(self._agent.ResetSession, request, timeout_s).session)
 
     def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:
         request = agent_pb2.GetSessionRequest(session_id=session_id)
-        return _summary(_call(self._agent.GetSession, request, timeout_s).session)
+        return _summary(self._call(self._agent.GetSession, request, timeout_s).session)
 
     def list_sessions(self, model: str, page_size: int, page_token: str, timeout_s: float) -> tuple[list[SessionSummary], str]:
         request = agent_pb2.ListSessionsRequest(model=model, page_size=page_size, page_token=page_token)
-        answer = _call(self._agent.ListSessions, request, timeout_s)
+        answer = self._call(self._agent.ListSessions, request, timeout_s)
         return [_summary(session) for session in answer.sessions], answer.next_page_token
 
     def close_session(self, session_id: str, timeout_s: float) -> None:
-        _call(self._agent.CloseSession, agent_pb2.CloseSessionRequest(session_id=session_id), timeout_s)
+        self._call(self._agent.CloseSession, agent_pb2.CloseSessionRequest(session_id=session_id), timeout_s)
 
     def models(self, timeout_s: float) -> list[Model]:
-        answer = _call(self._models.List, models_pb2.ListModelsRequest(), timeout_s)
+        answer = self._call(self._models.List, models_pb2.ListModelsRequest(), timeout_s)
         return [_model(model) for model in answer.models]
 
     def model(self, name: str, timeout_s: float) -> Model:
-        return _model(_call(self._models.Get, models_pb2.GetModelRequest(model=name), timeout_s).model)
+        return _model(self._call(self._models.Get, models_pb2.GetModelRequest(model=name), timeout_s).model)
 
     def close(self) -> None:
         self._channel.close()
 
+    def _call(self, verb: Callable[..., Any], request: Any, timeout_s: float) -> Any:
+        try:
+            return verb(request, timeout=timeout_s)
+        except grpc.RpcError as error:
+            raise _error_of_call(error, self._proxy) from None
+        except ValueError as error:  # the channel was closed under this call
+            raise Cancelled(str(error)) from None
 
-def _call(verb: Callable[..., Any], request: Any, timeout_s: float) -> Any:
-    try:
-        return verb(request, timeout=timeout_s)
-    except grpc.RpcError as error:
-        raise _error_of_call(error) from None
-    except ValueError as error:  # the channel was closed
-        raise UnexpectedAnswer(str(error)) from None
 
-
-def _error_of_call(error: grpc.RpcError) -> AdaError:
+def _error_of_call(error: grpc.RpcError, proxy: Proxy | None) -> AdaError:
     call = cast(grpc.Call, error)
     trailers = {key: value for key, value in call.trailing_metadata() or () if isinstance(value, str)}
+    reason = trailers.get("ada-reason", "")
+    by_proxy = f" ({proxy})" if proxy is not None and not reason else ""
     detail = Detail(
-        message=call.details() or "",
-        reason=trailers.get("ada-reason", ""),
+        message=(call.details() or "") + by_proxy,
+        reason=reason,
         field=trailers.get("ada-field", ""),
         committed_step=_number(trailers.get("ada-committed-step")),
         retry_after_ms=_number(trailers.get("grpc-retry-pushback-ms")),

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import http.client
+import io
 import json
 import math
 import socket
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeVar
 from urllib.parse import quote, urlencode
 
@@ -103,16 +106,19 @@ class HttpFace:
         self, method: str, path: str, body: Mapping[str, Any] | None, timeout_s: float
     ) -> tuple[int, http.client.HTTPMessage, bytes]:
         """One request and its whole answer. A connection that failed is not used again."""
+        end = time.monotonic() + timeout_s
         connection = self._take()
         connection.timeout = timeout_s
-        if connection.sock is not None:
-            connection.sock.settimeout(timeout_s)
         payload = None if body is None else json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
         headers = {"Accept": "application/json"}
         if payload is not None:
             headers["Content-Type"] = "application/json"
         try:
+            if connection.sock is None:
+                connection.connect()
+            connection.sock.settimeout(_left(end))
             connection.request(method, path, payload, headers)
+            connection.response_class = partial(_Response, end=end)
             response = connection.getresponse()
             text = response.read()
         except TimeoutError:
@@ -139,6 +145,40 @@ class HttpFace:
             if connection.sock is not None and _is_alive(connection.sock):
                 return connection
             connection.close()
+
+
+class _Response(http.client.HTTPResponse):
+    """An answer that has to be read by `end`: the standard library only bounds the wait for its next bytes."""
+
+    def __init__(self, sock: socket.socket, *, end: float, **settings: Any) -> None:
+        super().__init__(sock, **settings)
+        self.fp = io.BufferedReader(_Bounded(self.fp.detach(), sock, end))
+
+
+class _Bounded(io.RawIOBase):
+    """What the server sends, as long as there is time."""
+
+    def __init__(self, raw: io.RawIOBase, sock: socket.socket, end: float) -> None:
+        self._raw, self._sock, self._end = raw, sock, end
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        self._sock.settimeout(_left(self._end))
+        return self._raw.readinto(buffer)  # type: ignore[attr-defined]
+
+    def close(self) -> None:
+        self._raw.close()
+        super().close()
+
+
+def _left(end: float) -> float:
+    """Seconds until `end`, for a socket, to which 0 would mean another thing; TimeoutError if there are none."""
+    left_s = end - time.monotonic()
+    if left_s <= 0:
+        raise TimeoutError
+    return left_s
 
 
 def _is_alive(idle: socket.socket) -> bool:
