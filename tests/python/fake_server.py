@@ -51,6 +51,9 @@ class Core:
     sessions: dict[str, Session] = field(default_factory=dict)
     #: Every act that arrived: (session, step, observation).
     seen: list[tuple[str, int, object]] = field(default_factory=list)
+    #: Acts that a batch may hold, and the length of each batch that arrived.
+    batch_len_max: int = 256
+    batches: list[int] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def open(self) -> str:
@@ -58,6 +61,11 @@ class Core:
             name = f"s{len(self.sessions)}"
             self.sessions[name] = Session()
             return name
+
+    def batch(self, length: int) -> None:
+        self.batches.append(length)
+        if length > self.batch_len_max:
+            raise Refusal("TOO_LARGE")
 
     def act(self, name: str, step: int, observation: dict) -> tuple[list[float], bool]:
         """The action, and whether it is a replay."""
@@ -133,17 +141,24 @@ class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
         try:
             return self._act(request)
         except Refusal as refusal:
-            trailers = [("ada-reason", refusal.reason)]
-            if refusal.committed_step is not None:
-                trailers.append(("ada-committed-step", str(refusal.committed_step)))
-            if refusal.retry_after_ms is not None:
-                trailers.append(("grpc-retry-pushback-ms", str(refusal.retry_after_ms)))
-            if refusal.error_id:
-                trailers.append(("ada-error-id", refusal.error_id))
-            context.set_trailing_metadata(trailers)
-            context.abort(CODES[refusal.reason][0], "refused")
+            self._refuse(refusal, context)
+
+    def _refuse(self, refusal: Refusal, context) -> None:
+        trailers = [("ada-reason", refusal.reason)]
+        if refusal.committed_step is not None:
+            trailers.append(("ada-committed-step", str(refusal.committed_step)))
+        if refusal.retry_after_ms is not None:
+            trailers.append(("grpc-retry-pushback-ms", str(refusal.retry_after_ms)))
+        if refusal.error_id:
+            trailers.append(("ada-error-id", refusal.error_id))
+        context.set_trailing_metadata(trailers)
+        context.abort(CODES[refusal.reason][0], "refused")
 
     def ActBatch(self, request, context):  # noqa: N802
+        try:
+            self.core.batch(len(request.acts))
+        except Refusal as refusal:
+            self._refuse(refusal, context)
         results = []
         for act in request.acts:
             result = agent_pb2.ActResult(session_id=act.session_id, step=act.step)
@@ -191,6 +206,11 @@ class HttpFake(BaseHTTPRequestHandler):
         if self.path == "/v1/sessions":
             return self._answer(201, {"session": _session(self.core.open(), 0), "model": MODEL})
         if self.path == "/v1/act:batch":
+            try:
+                self.core.batch(len(body["acts"]))
+            except Refusal as refusal:
+                status = CODES[refusal.reason][1]
+                return self._answer(status, {"status": status, "reason": refusal.reason, "detail": "refused"})
             return self._answer(200, {"results": [self._result(act) for act in body["acts"]]})
         name, verb = self.path.split("/")[3:5]
         if verb == "reset":

@@ -15,6 +15,7 @@ from ada_diffuser import (
     AdaError,
     ChunkBroker,
     Client,
+    DeadlineExceeded,
     Executed,
     InvalidInput,
     NotFound,
@@ -27,6 +28,7 @@ from ada_diffuser import (
     StepConflict,
     TooLarge,
     Unavailable,
+    retry,
 )
 from ada_diffuser.errors import Detail, SessionGone, UnexpectedAnswer, from_detail
 from ada_diffuser.faces import connect
@@ -144,6 +146,70 @@ def test_a_session_cannot_stand_twice_in_a_batch(client: Client) -> None:
         client.act_batch([(session, Observation(STATE))] * 2)
 
 
+@pytest.mark.parametrize("rewards", [None, np.array([1.0, 2.0]), [[0.5, 0.5], None]])
+def test_a_batch_takes_arrays_as_an_act_does(client: Client, core: Core, rewards: object) -> None:
+    """`act` took arrays, and a vectorised simulator, which has nothing else, had to make N observations of its arrays."""
+    sessions = [client.open_session() for _ in range(2)]
+    states = np.array([[0.5, 1.5], [2.5, 3.5]])
+    client.act_batch(sessions, states)
+    client.act_batch(list(zip(sessions, states, strict=True)))
+    answers = client.act_batch(sessions, states, rewards=rewards)
+    told = [0.0, 0.0] if rewards is None else [1.0, 2.0] if isinstance(rewards, np.ndarray) else [1.0, 0.0]
+    assert [answer.actions[0].tolist() for answer in answers] == [[3.0 + told[0], 0.5], [3.0 + told[1], 2.5]]  # type: ignore[union-attr]
+    assert core.batches == [2, 2, 2]
+
+
+def test_a_wrong_array_of_a_batch_is_named(client: Client, core: Core) -> None:
+    sessions = [client.open_session() for _ in range(2)]
+    for states, rewards, field in (
+        (np.zeros((3, 2)), None, "states"),
+        (np.zeros((2, 2)), [1.0], "rewards"),
+        (np.array([[0.0, 0.0], [0.0, np.nan]]), None, "acts[1].observation.state[1]"),
+        (np.zeros((2, 2)), [1.0, np.inf], "acts[1].observation.executed[0].reward"),
+    ):
+        with pytest.raises(InvalidInput) as caught:
+            client.act_batch(sessions, states, rewards=rewards)
+        assert caught.value.field == field
+    with pytest.raises(ValueError, match="states"):
+        client.act_batch(sessions)
+    assert not core.seen
+
+
+def test_a_batch_beyond_the_servers_limit_is_split(client: Client, core: Core) -> None:
+    """More simulators than that got TOO_LARGE: the limit is a setting of the server that no client can ask for."""
+    core.batch_len_max = 4
+    sessions = [client.open_session() for _ in range(11)]
+    states = np.arange(22.0).reshape(11, 2)
+    answers = client.act_batch(sessions, states)
+    assert [answer.actions[0, 1] for answer in answers] == states[:, 0].tolist()  # type: ignore[union-attr]
+    assert core.batches == [11, 5, 2, 2, 2, 2, 2, 1]
+    core.batches.clear()
+    core.faults = [Refusal("QUEUE_FULL")]
+    assert all(answer.step == 2 for answer in client.act_batch(sessions, states))  # type: ignore[union-attr]
+    assert core.batches == [2, 2, 2, 2, 2, 1, 1], "what it takes is remembered, and only what failed is sent again"
+
+
+def test_an_act_too_large_by_itself_is_the_error_of_that_act(client: Client, core: Core) -> None:
+    core.batch_len_max = 0
+    sessions = [client.open_session() for _ in range(2)]
+    assert [type(answer) for answer in client.act_batch(sessions, np.zeros((2, 2)))] == [TooLarge, TooLarge]
+    core.batch_len_max = 2
+    assert all(not isinstance(answer, AdaError) for answer in client.act_batch(sessions, np.zeros((2, 2))))
+    assert core.batches == [2, 1, 1, 2]
+
+
+def test_a_newer_observation_after_a_lost_answer_is_told_the_way_on(core: Core) -> None:
+    """A control loop does not wait: it goes on with what it sees now. The server then says what is wrong, but not what to do."""
+    with serving(core, "http") as url, Client(url, retry=RetryPolicy(attempts=1)) as client, client.open_session() as session:
+        core.faults = ["lost"]
+        with pytest.raises(Unavailable):
+            session.act(STATE)
+        with pytest.raises(PayloadMismatch, match=r"act with its observation again, or call session\.catch_up\(\).*nothing_executed"):
+            session.act([9.0, 9.0])
+        assert session.catch_up() == 1
+        assert session.act([9.0, 9.0], nothing_executed=True).step == 2
+
+
 @pytest.mark.parametrize(
     ("state", "executed", "field"),
     [
@@ -217,6 +283,54 @@ def test_a_reset_starts_over(client: Client) -> None:
         broker.reset(seed=5)
         assert session.committed_step == 0 and broker.due
         assert broker.action(STATE)[0] == 1.0
+
+
+class Clock:
+    """`time` as the module of retries sees it."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+@pytest.mark.parametrize("takes_s", [0.0, 0.5, 2.0, 30.0])
+def test_a_request_takes_no_longer_than_its_timeout_and_the_budget(monkeypatch: pytest.MonkeyPatch, takes_s: float) -> None:
+    """Only the waits counted: a retry begun within the budget could outlast it. Calls of 25 s took 75 s with a budget of 30."""
+    clock, timeouts = Clock(), []
+    monkeypatch.setattr(retry, "time", clock)
+    policy = RetryPolicy(attempts=8, base_s=0.1, cap_s=1.0, budget_s=5.0)
+
+    def call(timeout_s: float) -> None:
+        timeouts.append(timeout_s)
+        clock.sleep(min(takes_s, timeout_s))
+        raise DeadlineExceeded("no answer")
+
+    with pytest.raises(DeadlineExceeded):
+        policy.run(call, 3.0)
+    assert len(timeouts) <= policy.attempts and timeouts[0] == 3.0 and max(timeouts) <= 3.0
+    assert clock.now_s <= min(takes_s, 3.0) + policy.budget_s + 1e-6
+    if takes_s == 0.0:
+        assert len(timeouts) == policy.attempts, "all attempts, where the budget allows them"
+
+
+def test_a_policy_is_one() -> None:
+    for wrong in ({"attempts": 0}, {"budget_s": -1.0}, {"base_s": math.nan}, {"cap_s": math.inf}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            RetryPolicy(**wrong)  # type: ignore[arg-type]
+
+
+def test_an_error_names_a_thing_once() -> None:
+    """`OBSERVATION_INVALID: observation.state: observation.state: has 3 values`, and `internal error (e-1): error id e-1`."""
+    wrong = InvalidInput(Detail("observation.state: has 3 values", "OBSERVATION_INVALID", "observation.state"))
+    assert str(wrong) == "OBSERVATION_INVALID: observation.state: has 3 values"
+    assert str(InvalidInput(Detail("has 3 values", field="states"))) == "states: has 3 values"
+    assert str(ServerFault(Detail("internal error (e-1)", "INTERNAL", error_id="e-1"))) == "INTERNAL: internal error (e-1)"
+    assert str(ServerFault(Detail("broken", error_id="e-1"))) == "broken: error id e-1"
 
 
 def test_options_from_words() -> None:

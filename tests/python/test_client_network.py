@@ -8,10 +8,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
+import numpy as np
 import pytest
 from fake_server import Core, serving
 
-from ada_diffuser import Client, DeadlineExceeded, RetryPolicy, Unavailable
+from ada_diffuser import Client, DeadlineExceeded, RetryPolicy, TooLarge, Unavailable
 from ada_diffuser.faces.proxy import Proxy, proxy_to
 
 FACES = ("grpc", "http")
@@ -112,3 +113,25 @@ def test_an_answer_that_drips_in_does_not_outlast_the_timeout(part: str) -> None
 def test_a_timeout_is_a_time(timeout_s: float) -> None:
     with pytest.raises(ValueError, match="timeout_s"):
         Client("http://127.0.0.1:1", timeout_s=timeout_s)
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_a_body_that_is_too_large_is_sent_once_and_says_so(address: str, face: str) -> None:
+    """Over REST a server answers 413 and hangs up while the body is being sent: the client saw a broken pipe, and sent it six times."""
+    policy = RetryPolicy(base_s=30.0, cap_s=30.0)
+    with Client(f"{face}://{address}", retry=policy) as client, client.open_session() as session:
+        started = time.monotonic()
+        with pytest.raises(TooLarge):
+            session.act(np.zeros(2_000_000))
+        assert time.monotonic() - started < 15, "no wait before a second time"
+        assert session.act(np.zeros(4)).step == 1
+
+
+def test_a_real_batch_beyond_the_limit(address: str) -> None:
+    """260 acts were TooLarge: 'number of acts exceeds 256'."""
+    with Client(f"http://{address}") as client:
+        sessions = [client.open_session(seed=1) for _ in range(260)]
+        answers = client.act_batch(sessions, np.zeros((260, 4)))
+        assert len({answer.actions.tobytes() for answer in answers}) == 1  # type: ignore[union-attr]
+        for session in sessions:
+            session.close()

@@ -16,14 +16,15 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ada_diffuser.errors import AdaError, InvalidInput, NotFound, StepConflict, Unavailable
+from ada_diffuser.errors import AdaError, InvalidInput, NotFound, StepConflict, TooLarge, Unavailable
 from ada_diffuser.faces import Face, connect
 from ada_diffuser.messages import (
     ActCall,
@@ -37,6 +38,8 @@ from ada_diffuser.messages import (
 )
 from ada_diffuser.retry import Backoff, RetryPolicy
 from ada_diffuser.values import column, flag, invalid, text, vector, whole
+
+T = TypeVar("T")
 
 #: Longer than anybody waits, and short enough for every clock below.
 _TIMEOUT_S_MAX = 1e8
@@ -59,6 +62,8 @@ class Client:
         if not 0 < self._timeout_s <= _TIMEOUT_S_MAX:
             raise ValueError(f"timeout_s = {timeout_s} is no number of seconds above 0, up to {_TIMEOUT_S_MAX:g}")
         self._retry = retry or RetryPolicy()
+        # Acts of a batch that the server takes; None: as many as there are, until it refuses.
+        self._batch_len: int | None = None
         self._closed = False
         # By process: what was connected before a fork belongs to the parent. Here it is neither used nor closed.
         self._faces: dict[int, Face] = {os.getpid(): connect(url)}
@@ -70,6 +75,9 @@ class Client:
             raise RuntimeError("this client was closed: make a new one")
         process = os.getpid()
         return self._faces.get(process) or self._faces.setdefault(process, connect(self.url))
+
+    def _tried(self, call: Callable[[float], T], retryable: Callable[[AdaError], bool] = lambda error: error.retryable) -> T:
+        return self._retry.run(call, self._timeout_s, retryable)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_faces": {}}
@@ -105,12 +113,12 @@ class Client:
 
     def models(self) -> list[Model]:
         """All loaded models, by name."""
-        return self._retry.run(lambda: self._face.models(self._timeout_s))
+        return self._tried(lambda timeout_s: self._face.models(timeout_s))
 
     def model(self, name: str | None = "") -> Model:
         """One model, `name` or `name@digest`; empty: the default one."""
         name = _model_name(name)
-        return self._retry.run(lambda: self._face.model(name, self._timeout_s))
+        return self._tried(lambda timeout_s: self._face.model(name, timeout_s))
 
     def open_session(
         self,
@@ -126,7 +134,7 @@ class Client:
         """
         name, wanted = _model_name(model), _options(options)
         seed, ttl_ms = _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
-        summary, spec = self._retry.run(lambda: self._face.open_session(name, seed, wanted, ttl_ms, self._timeout_s))
+        summary, spec = self._tried(lambda timeout_s: self._face.open_session(name, seed, wanted, ttl_ms, timeout_s))
         return Session(self, summary, spec)
 
     def attach(self, session_id: str) -> Session:
@@ -137,31 +145,49 @@ class Client:
     def summary(self, session_id: str) -> SessionSummary:
         """The state of a session."""
         session_id = _session_id(session_id)
-        return self._retry.run(lambda: self._face.get_session(session_id, self._timeout_s))
+        return self._tried(lambda timeout_s: self._face.get_session(session_id, timeout_s))
 
     def sessions(self, model: str | None = "", page_size: int = 0) -> Iterator[SessionSummary]:
         """All sessions, by id; page after page as they are consumed."""
         name, size, token = _model_name(model), whole(page_size, "page_size", bits=32), ""
         while True:
-            page, token = self._retry.run(
-                lambda token=token: self._face.list_sessions(name, size, token, self._timeout_s)  # type: ignore[misc]
+            page, token = self._tried(
+                lambda timeout_s, token=token: self._face.list_sessions(name, size, token, timeout_s)  # type: ignore[misc]
             )
             yield from page
             if not token:
                 return
 
     def act_batch(
-        self, acts: Sequence[tuple[Session, Observation]], *, deadline_ms: int | None = None, planned_states: bool = False
+        self,
+        acts: Sequence[tuple[Session, Observation | ArrayLike]] | Sequence[Session],
+        states: Sequence[ArrayLike] | NDArray[Any] | None = None,
+        *,
+        rewards: Sequence[ArrayLike | None] | NDArray[Any] | None = None,
+        deadline_ms: int | None = None,
+        planned_states: bool = False,
     ) -> list[Chunk | AdaError]:
-        """One act in each of many different sessions, in one call. Each has its own answer or error, in the order of `acts`.
+        """One act in each of many different sessions. Each has its own answer or error, in the order of `acts`.
 
-        Only the acts that failed in a retryable way are sent again. Raises what concerns the call as a whole.
+        `acts` are pairs of a session and its observation, or its state where nothing else is to be told; or sessions alone, N of
+        them, with `states` `(N, state_dim)` and `rewards`: of a session the number or numbers that `act` takes as `reward`, so
+        `(N,)` or `(N, steps)`, None where none is known.
+
+        More acts than the server takes in one call are sent in several; only those that failed in a retryable way are sent
+        again. An act that is too large by itself has that as its error; what else concerns a call as a whole is raised, and then
+        no session has moved on here: the same batch again gets the answers that were lost.
         """
-        if len({session.session_id for session, _ in acts}) != len(acts):
+        pairs = _pairs(acts, states, rewards)
+        if len({session.session_id for session, _ in pairs}) != len(pairs):
             raise ValueError("a session stands twice in the batch: one act a session is in flight")
-        calls = [session.next_call(observation, deadline_ms, planned_states) for session, observation in acts]
+        calls = []
+        for i, (session, observation) in enumerate(pairs):
+            try:
+                calls.append(session.next_call(observation, deadline_ms, planned_states))
+            except InvalidInput as error:
+                raise InvalidInput(replace(error.detail, field=f"acts[{i}].{error.field}")) from None
         results = self._batch_until_settled(calls)
-        for (session, _), result in zip(acts, results, strict=True):
+        for (session, _), result in zip(pairs, results, strict=True):
             if isinstance(result, Chunk):
                 session.commit(result)
         return results
@@ -169,36 +195,79 @@ class Client:
     def _batch_until_settled(self, calls: Sequence[ActCall]) -> list[Chunk | AdaError]:
         settled: dict[int, Chunk | AdaError] = {}
         pending = list(range(len(calls)))
-        backoff = Backoff(self._retry)
+        backoff = Backoff(self._retry, self._timeout_s)
         while pending:
-            try:
-                results = self._face.act_batch([calls[i] for i in pending], self._timeout_s)
-            except AdaError as error:
-                if not error.retryable:
-                    raise
-                results = [error] * len(pending)
-            settled.update(zip(pending, results, strict=True))
+            settled.update(zip(pending, self._batch([calls[i] for i in pending], backoff), strict=True))
             failed = [(i, result) for i, result in settled.items() if isinstance(result, AdaError) and result.retryable]
             pending = [i for i, _ in failed]
             if pending and not backoff.wait(max(error.retry_after_ms or 0 for _, error in failed)):
                 break
         return [settled[i] for i in range(len(calls))]
 
+    def _batch(self, calls: Sequence[ActCall], backoff: Backoff) -> list[Chunk | AdaError]:
+        """One attempt of each. No answer says how much the server takes, in acts or bytes: what it refuses is halved."""
+        results: list[Chunk | AdaError] = []
+        part_len = self._batch_len or len(calls)
+        taken_len, refused = 0, False
+        while len(results) < len(calls):
+            part = calls[len(results) :][:part_len]
+            try:
+                results += self._face.act_batch(part, backoff.timeout_s())
+                taken_len = max(taken_len, len(part))
+            except TooLarge as error:
+                refused = True
+                if len(part) > 1:
+                    part_len = len(part) // 2
+                else:
+                    results.append(error)
+                    part_len = self._batch_len or len(calls)
+            except AdaError as error:
+                if not error.retryable:
+                    raise
+                results += [error] * len(part)
+        if refused and taken_len:
+            self._batch_len = taken_len
+        return results
+
     def _act(self, call: ActCall) -> Chunk:
-        return self._retry.run(lambda: self._face.act(call, self._timeout_s))
+        return self._tried(lambda timeout_s: self._face.act(call, timeout_s))
 
     def _reset(self, session_id: str, seed: int | None, keep_history: bool) -> SessionSummary:
         seed, keep_history = _whole_if_given(seed, "seed"), flag(keep_history, "keep_history")
         # An act that was given up here may still be in flight there, for a moment: worth the wait.
-        return self._retry.run(
-            lambda: self._face.reset_session(session_id, seed, keep_history, self._timeout_s),
+        return self._tried(
+            lambda timeout_s: self._face.reset_session(session_id, seed, keep_history, timeout_s),
             lambda error: error.retryable or isinstance(error, StepConflict),
         )
 
     def _close_session(self, session_id: str) -> None:
         # Not found: a close whose answer was lost, or the session expired. It is closed either way.
         with suppress(NotFound):
-            self._retry.run(lambda: self._face.close_session(session_id, self._timeout_s))
+            self._tried(lambda timeout_s: self._face.close_session(session_id, timeout_s))
+
+
+def _pairs(
+    acts: Sequence[tuple[Session, Observation | ArrayLike]] | Sequence[Session],
+    states: Sequence[ArrayLike] | NDArray[Any] | None,
+    rewards: Sequence[ArrayLike | None] | NDArray[Any] | None,
+) -> list[tuple[Session, Observation]]:
+    """What `Client.act_batch` was given, as sessions with their observations."""
+    if states is None:
+        if rewards is not None or any(isinstance(act, Session) for act in acts):
+            raise ValueError("sessions alone, and rewards, need `states`; else each act is a pair of a session and its observation")
+        pairs: Sequence[Any] = acts
+        return [(session, seen if isinstance(seen, Observation) else Observation(seen)) for session, seen in pairs]
+    for name, rows in (("states", states), ("rewards", rewards)):
+        if rows is not None and len(rows) != len(acts):
+            raise invalid(name, f"has {len(rows)} rows for {len(acts)} sessions")
+    told = [None] * len(acts) if rewards is None else rewards
+    sessions: Sequence[Any] = acts
+    return [(session, Observation(state, _rewarded(reward))) for session, state, reward in zip(sessions, states, told, strict=True)]
+
+
+def _rewarded(reward: ArrayLike | None) -> list[Executed]:
+    """Steps of which the rewards are known: one number, or one for each."""
+    return [] if reward is None else [Executed(reward=value) for value in column(reward, "observation.reward")]
 
 
 def _model_name(name: str | None) -> str:
@@ -276,7 +345,7 @@ class Session:
         if reward is not None:
             if len(executed):
                 raise ValueError("rewards stand in `executed` when it is given")
-            executed = [Executed(reward=value) for value in column(reward, "observation.reward")]
+            executed = _rewarded(reward)
         call = self.next_call(Observation(state, executed, nothing_executed), deadline_ms, planned_states)
         chunk = self._client._act(call)
         self.commit(chunk)

@@ -30,6 +30,8 @@ class AdaError(Exception):
 
     #: Whether the same request may succeed if it is sent again, unchanged.
     retryable = False
+    #: The way on, where the server cannot know it; part of the text.
+    cure = ""
 
     def __init__(self, detail: Detail | str) -> None:
         self.detail = Detail(detail) if isinstance(detail, str) else detail
@@ -60,8 +62,10 @@ class AdaError(Exception):
         return self.detail.error_id
 
     def __str__(self) -> str:
-        parts = [self.reason, self.field, self.message, f"error id {self.error_id}" if self.error_id else ""]
-        return ": ".join(part for part in parts if part)
+        # The server's own messages begin with the field, and hold the id, where there is one: each is named once.
+        field = "" if self.message.startswith(self.field) else self.field
+        error_id = "" if self.error_id in self.message else f"error id {self.error_id}"
+        return ": ".join(part for part in (self.reason, field, self.message, error_id, self.cure) if part)
 
     def __reduce__(self) -> tuple[type[AdaError], tuple[Detail]]:
         return type(self), (self.detail,)
@@ -88,7 +92,12 @@ class StepConflict(AdaError):
 
 
 class PayloadMismatch(AdaError):
-    """This step was taken with another observation. STEP_PAYLOAD_MISMATCH."""
+    """This step was taken with another observation, its answer was lost. STEP_PAYLOAD_MISMATCH."""
+
+    cure = (
+        "the answer of that act was lost; either act with its observation again, or call session.catch_up() and act with what was "
+        "executed since then (nothing_executed=True if nothing was)"
+    )
 
 
 class Overloaded(AdaError):

@@ -117,8 +117,12 @@ class HttpFace:
             if connection.sock is None:
                 connection.connect()
             connection.sock.settimeout(_left(end))
-            connection.request(method, path, payload, headers)
             connection.response_class = partial(_Response, end=end)
+            refused = False
+            try:
+                connection.request(method, path, payload, headers)
+            except (BrokenPipeError, ConnectionResetError):
+                refused = True  # perhaps it was too large, and the answer that says so is there already
             response = connection.getresponse()
             text = response.read()
         except TimeoutError:
@@ -128,7 +132,7 @@ class HttpFace:
             connection.close()
             raise Unavailable(f"{self._host}:{self._port}: {error or type(error).__name__}") from None
         with self._lock:
-            kept = not (response.will_close or self._closed)
+            kept = not (response.will_close or refused or self._closed)
             if kept:
                 self._idle.append(connection)
         if not kept:
