@@ -143,8 +143,11 @@ def test_a_log_gets_lines_and_no_bar(capsys: pytest.CaptureFixture[str], monkeyp
     with progress.progress(40, "episodes", "episode") as advance:
         for _ in range(40):
             advance(1)
+        for _ in range(9):
+            advance(0)  # a search asks now and then, also while its policies are compared afterwards
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "episodes: 3 of 40 episodes (7 %), 0.188 a second, 3:17 left"
+    assert not any("100 %" in line for line in lines), "what is over has no time left to tell"
     assert 5 < len(lines) < 20 and all(len(line) < 100 and "\r" not in line for line in lines)
 
 

@@ -27,7 +27,7 @@ def progress(total: int, title: str, unit: str, *, quiet: bool = False) -> Itera
 
 @dataclass
 class _Lines:
-    """One line each ten seconds, so that a log stays readable; a task that takes less leaves none."""
+    """One line each ten seconds, so that a log stays readable; a task that takes less leaves none, nor does one that is over."""
 
     total: int
     title: str
@@ -39,7 +39,7 @@ class _Lines:
     def add(self, made: int) -> None:
         self.made += made
         now = time.monotonic()
-        if now - self.told < LINE_EVERY_S or not self.made:
+        if now - self.told < LINE_EVERY_S or not 0 < self.made < self.total:
             return
         self.told = now
         rate = self.made / (now - self.started)
