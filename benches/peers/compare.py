@@ -57,6 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     # torch.compile by the process itself: workers that outlive it would be taken for others at work.
     os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
+    if arguments.json:  # now, and not after half an hour of measuring
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
     cores = machine.pin(arguments.cores)
     facts = machine.describe(cores)
     _say(f"{facts['processor']}, cores {facts['cores']}, PyTorch {facts['torch']}")

@@ -96,10 +96,20 @@ def test_what_cannot_be_written_is_told_before_anything_is_run(here: Path, capsy
         (rollout.main, [*rolled, "--film", "a.mp4"], "--film must end in .gif"),
         (evaluate.main, [*judged, "--json", "file/a.json"], "--json file/a.json"),
         (collect, ["--env", "point-wind-s", "--quiet", "--out", "file/a.h5"], "--out file/a.h5"),
+        (rollout.main, ["--env", "their_module:Theirs-v1", "--url", "127.0.0.1:1"], "Theirs-v1"),
+        (evaluate.main, ["--env", "CartPole-v1", "--url", "127.0.0.1:1"], "Discrete(2)"),
     ]:
         assert main(words) in (1, 2)
         error = capsys.readouterr().err
         assert names in error and error.count("\n") == 1, error
+
+
+def test_a_wait_is_a_number_of_seconds(capsys: pytest.CaptureFixture[str]) -> None:
+    """`--wait nan` waited for ever."""
+    for wait in ("nan", "inf", "-1", "soon"):
+        with pytest.raises(SystemExit):
+            rollout.main(["--env", "point-wind-s", f"--wait={wait}"])
+        assert "--wait" in capsys.readouterr().err
 
 
 def test_models_and_settings_are_checked_before_the_first_episode(here: Path, address: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -182,6 +182,25 @@ def test_what_cannot_be_taken_is_told_in_one_sentence(theirs, capsys, flags, wor
     assert not Path("a.h5").exists()
 
 
+def test_an_environment_is_one_class_that_says_all_of_itself(theirs, capsys):
+    """Expert, noise, failure and length were looked up by the names of this package's own classes, in four other files."""
+    (theirs / "calm.py").write_text(
+        "from ada_diffuser.environments import CheetahWindS\n"
+        "class Calm(CheetahWindS, name='calm', id='theirs/Calm-v0'):\n"
+        "    episode_steps, action_noise, mean = 4, (0.5,), 0.0\n"
+        "    def failed(self, episode_return): return True\n"
+    )
+    flags = ["--episodes", "2", "--quiet", "--expert-searches", "1", "--expert-iterations", "1"]
+    assert collect(["--env", "calm:theirs/Calm-v0", "--out", "a.h5", *flags]) == 0
+    card = json.loads(Path("a.card.json").read_text())
+    assert (card["steps"], card["action_noise"], card["returns"]["failures"]) == (8, [0.5], 2)
+    assert card["expert"]["recipe"]["env"] == "calm:theirs/Calm-v0"
+    assert collect(["--env", "calm", "--out", "b.h5", *flags, "--expert", "a.expert.npz"]) == 0, "its short name, once it is imported"
+    assert Path("a.h5").read_bytes() == Path("b.h5").read_bytes()
+    del environments.NAMES["calm"], sys.modules["calm"]
+    capsys.readouterr()
+
+
 # ---- PointWind-S ----
 
 

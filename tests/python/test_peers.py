@@ -73,3 +73,12 @@ def test_rows_are_told_apart_and_idle_cores_are_idle() -> None:
     texts = [goal.text for one in trials() for goal in one.goals]
     assert len(texts) == len(set(texts)) > 10
     assert Watch([0]).others() >= 0.0
+
+
+def test_the_folder_of_the_results_is_there_before_anything_is_measured(tmp_path, monkeypatch) -> None:
+    """--json into a folder that was not there failed after the first trial."""
+    monkeypatch.setattr(compare.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(compare.machine, "pin", lambda cores: sys.exit("measuring begins"))
+    with pytest.raises(SystemExit, match="measuring begins"):
+        compare.main(["--json", str(tmp_path / "new/folder/a.json")])
+    assert (tmp_path / "new/folder").is_dir()

@@ -29,7 +29,13 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
     """Where the server is, and which face is used."""
     parser.add_argument("--url", default=DEFAULT_URL, help=f"host:port, grpc:// or http:// before it or not (default {DEFAULT_URL})")
     parser.add_argument("--face", choices=("grpc", "http"), help="(default: what the url says, else grpc)")
-    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help="wait so long for the server (default 10)")
+    parser.add_argument("--wait", type=seconds, default=10.0, metavar="S", help="wait so long for the server (default 10)")
+
+
+def seconds(text: str) -> float:
+    if not 0 <= float(text) < float("inf"):
+        raise ValueError
+    return float(text)
 
 
 def server_url(url: str, face: str | None) -> str:
@@ -83,6 +89,11 @@ def import_environments() -> ModuleType:
     except RuntimeError as error:
         raise ValueError(f"MuJoCo cannot be loaded: {error}") from error
     return environments
+
+
+def check_environment(arguments: argparse.Namespace) -> None:
+    """Raises `ValueError` for an environment that cannot be made, before a server is waited for."""
+    import_environments().make(arguments.env, episode_steps=arguments.episode_steps).close()
 
 
 def _sentence(error: Exception) -> str:

@@ -50,11 +50,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace, command: str) -> None:
     """Plan, expert, episodes, files; then the data card, or what matters of it."""
     _check_arguments(args)
-    import_environments()
+    job, recipe = _plan(args)
     from ada_diffuser.collect import collect, data_card
     from ada_diffuser.dataset import save_card, save_episodes
 
-    job, recipe = _plan(args)
     expert = _expert(args, job, recipe)
     with progress(job.episodes, "episodes", "episode", quiet=args.quiet) as advance:
         episodes, failures = collect(job, expert, advance)
@@ -100,7 +99,7 @@ def _check_arguments(args: argparse.Namespace) -> None:
 
 def _plan(args: argparse.Namespace) -> tuple[Job, ExpertRecipe | None]:
     """What to fly and, where the expert is to be searched for, how. Raises `ValueError` naming the argument that is wrong."""
-    from ada_diffuser import environments
+    environments = import_environments()
     from ada_diffuser.collect import Job, default_noise
     from ada_diffuser.experts import recipe_for
     from ada_diffuser.experts.ars import ArsSettings

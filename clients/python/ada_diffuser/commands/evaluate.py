@@ -13,7 +13,7 @@ from ada_diffuser.client import Client
 from ada_diffuser.commands import (
     add_environment_arguments,
     add_server_arguments,
-    import_environments,
+    check_environment,
     parse_settings,
     run_command,
     server_url,
@@ -70,7 +70,7 @@ def _run(arguments: argparse.Namespace) -> None:
     models = [model.strip() for model in arguments.models.split(",")]
     if len(models) > 1 and not all(models):
         raise ValueError(f"--models {arguments.models!r} has an empty name")
-    import_environments()
+    check_environment(arguments)
     from ada_diffuser.rollout import Trial
     from ada_diffuser.rollout.report import markdown
 

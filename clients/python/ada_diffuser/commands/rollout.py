@@ -12,7 +12,7 @@ from ada_diffuser.client import Client
 from ada_diffuser.commands import (
     add_environment_arguments,
     add_server_arguments,
-    import_environments,
+    check_environment,
     parse_settings,
     run_command,
     server_url,
@@ -60,7 +60,7 @@ def _run(arguments: argparse.Namespace) -> None:
     check_output("--json", arguments.json)
     check_output("--plot", arguments.plot, ".png", ".pdf", ".svg", ".jpg")
     check_output("--film", arguments.film, ".gif")
-    import_environments()
+    check_environment(arguments)
     from ada_diffuser.rollout import Trial, check, evaluate
     from ada_diffuser.rollout.readout import fit
     from ada_diffuser.rollout.report import table
