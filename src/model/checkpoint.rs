@@ -26,6 +26,8 @@ const MANIFEST: &str = "manifest.json";
 const HEADER_BYTES_MAX: u64 = 1 << 20;
 /// Largest weight file, in bytes.
 const WEIGHT_BYTES_MAX: u64 = 1 << 30;
+/// How often a checkpoint may be replaced while one is waiting to read it.
+const REPLACED_MAX: usize = 100;
 
 /// Longest name of a model, in characters.
 pub const NAME_LEN_MAX: usize = 64;
@@ -153,12 +155,17 @@ pub fn load_as(dir: &Path, precision: Precision) -> Result<Agent, CheckpointErro
     agent(dir, &read_files(dir)?, precision)
 }
 
-/// The files of a checkpoint, also of one that is replaced while it is read.
+/// The files of a checkpoint, also of one that is replaced while it is read: as long as there is another manifest each time, it is read
+/// again.
 fn read_files(dir: &Path) -> Result<Files, CheckpointError> {
-    let before = load_manifest(dir)?.1;
-    let found = Files::read(dir);
-    let is_replaced = || load_manifest(dir).is_ok_and(|(_, now)| now != before);
-    if found.is_err() && is_replaced() { Files::read(dir) } else { found }
+    for _ in 0..REPLACED_MAX {
+        let before = load_manifest(dir)?.1;
+        let found = Files::read(dir);
+        if found.is_ok() || load_manifest(dir)?.1 == before {
+            return found;
+        }
+    }
+    Files::read(dir)
 }
 
 /// Checks all of it and builds the agent; `dir` is for messages.

@@ -10,7 +10,7 @@ use crate::model::{
 use proptest::{prelude::*, sample::select};
 use std::{fs, path::Path};
 
-const KEYS: [&str; 44] = [
+const KEYS: [&str; 47] = [
     "seed",
     "checkpoint_every",
     "log_every",
@@ -55,6 +55,9 @@ const KEYS: [&str; 44] = [
     "restart.cold_distance",
     "restart.latent_jump",
     "gate.filter",
+    "hide.state",
+    "hide.action",
+    "hide.reward",
 ];
 const VALUES: [&str; 22] = [
     "-1",
@@ -81,6 +84,24 @@ const VALUES: [&str; 22] = [
     "2305843009213693953",
 ];
 const WIDTHS: [&str; 8] = ["[]", "[4]", "[8, 16]", "[0]", "[9]", "[4, 4, 4]", "[1000000]", "[4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4]"];
+
+/// Keys with lists and words.
+const LISTS: [&str; 14] = [
+    "stage2.action_horizons=[]",
+    "stage2.action_horizons=[0]",
+    "stage2.action_horizons=[1, 2]",
+    "stage2.action_horizons=[4, 1000000]",
+    "stage2.routing=literal",
+    "actions.units=gaussian",
+    "actions.units=as_is",
+    "actions.low=[-1.0, -1.0]",
+    "actions.low=[nan, 0.0]",
+    "actions.low=[-1e39, 0.0]",
+    "actions.low=[5.0, 5.0]",
+    "actions.low=[1.0]",
+    "actions.high=[inf, 1.0]",
+    "actions.high=[3e38, 1e-30]",
+];
 
 /// One act of a checkpoint made from a legal recipe with fresh networks.
 fn ships(recipe: &Recipe) -> Result<(), String> {
@@ -127,10 +148,12 @@ proptest! {
     fn every_legal_recipe_ships_what_loads(
         changes in prop::collection::vec((select(&KEYS[..]), select(&VALUES[..])), 1..3),
         widths in prop::option::of(select(&WIDTHS[..])),
+        list in prop::option::of(select(&LISTS[..])),
     ) {
         let dit = "model.denoiser={kind = \"dit\", width = 8, depth = 1, heads = 2}".to_string();
         let denoiser = widths.map_or(dit, |widths| format!("model.denoiser={{kind = \"unet\", widths = {widths}}}"));
-        let changes: Vec<String> = std::iter::once(denoiser).chain(changes.iter().map(|(key, value)| format!("{key}={value}"))).collect();
+        let changes: Vec<String> = std::iter::once(denoiser).chain(changes.iter().map(|(key, value)| format!("{key}={value}")))
+            .chain(list.map(String::from)).collect();
         prop_assert_eq!(check(&changes), Ok(()), "{:?}", changes);
     }
 }

@@ -2,6 +2,8 @@
 //! (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here the crank is turned.
 pub mod amend;
 pub mod ceiling;
+#[cfg(test)]
+mod change_tests;
 pub mod dataset;
 pub mod defaults;
 pub mod flags;

@@ -292,6 +292,9 @@ impl Recipe {
         for (key, value) in [("checkpoint_every", self.checkpoint_every), ("log_every", self.log_every)] {
             require(value >= 1, key, "must be at least 1")?;
         }
+        for (key, bounds) in [("actions.low", &self.actions.low), ("actions.high", &self.actions.high)] {
+            require(bounds.iter().all(|bound| bound.is_finite()), key, "must be finite numbers; leave it out to take the data's")?;
+        }
         for (key, share) in [("hide.state", self.hide.state), ("hide.action", self.hide.action), ("hide.reward", self.hide.reward)] {
             require((0.0..=1.0).contains(&share), key, "must lie in 0..=1")?;
         }

@@ -82,26 +82,25 @@ pub fn inspect(dir: &Path) -> Result<Value> {
     Ok(json!({
         "digest": digest,
         "parameters": {"latent": parameters("latent."), "denoiser": parameters("denoiser.")},
-        "config": agent.config(),
+        // By way of text, where a number of 32 bits has the digits that a person gave it.
+        "config": serde_json::from_str::<Value>(&serde_json::to_string(agent.config())?)?,
         "provenance": manifest.provenance,
     }))
 }
 
-/// Fields of the configuration that are told in other words, or are too long to tell.
-const NOT_TOLD: [&str; 4] = ["normalizer", "refined", "sub_steps_trained", "sampler"];
+/// Fields of the configuration that stand in front, are told in other words, or are too long to tell.
+const NOT_LISTED: [&str; 7] =
+    ["sampler", "restart", "refined", "sub_steps_trained", "action_horizons_trained", "missing_trained", "normalizer"];
 
 /// [`inspect`] for people: first what is in force when the checkpoint is served, last the recipe that it was trained with.
 pub fn inspect_text(value: &Value) -> String {
     let (config, provenance) = (&value["config"], &value["provenance"]);
     let pair = |name: &str, value: &Value| format!("{name:<11} {}\n", told(value));
-    let mut text = pair("digest", &value["digest"]) + &pair("sampler", &config["sampler"]);
-    for (key, value) in config.as_object().into_iter().flatten().filter(|(key, _)| !NOT_TOLD.contains(&key.as_str())) {
+    let mut text = pair("digest", &value["digest"]) + &pair("sampler", &config["sampler"]) + &pair("restart", &config["restart"]);
+    text += &pair("trained for", &trained(config));
+    for (key, value) in config.as_object().into_iter().flatten().filter(|(key, _)| !NOT_LISTED.contains(&key.as_str())) {
         text += &if key == "latent" && value.is_null() { pair(key, &"none".into()) } else { pair(key, value) };
     }
-    let mut sub_steps: Vec<&Value> = config["sub_steps_trained"].as_array().into_iter().flatten().collect();
-    sub_steps.insert(0, &config["sampler"]["sub_steps"]);
-    sub_steps.dedup();
-    text += &pair("trained for", &json!({"sub_steps": sub_steps, "refinement (kappa above 0)": config["refined"]}));
     text += &pair("parameters", &value["parameters"]);
     for key in ["dataset", "dataset_sha256", "seed"] {
         text += &pair(key, &provenance[key]);
@@ -109,6 +108,24 @@ pub fn inspect_text(value: &Value) -> String {
     text += &format!("metrics     {}\n", provenance["metrics"]);
     let note = "recipe (as it was trained; sampler and restart above are in force, a session may choose another sampler)\n";
     text + note + &indent(provenance["recipe"].as_str().unwrap_or_default())
+}
+
+/// What training covered: the default and what a session may ask for beside it.
+fn trained(config: &Value) -> Value {
+    let with_default = |trained: &Value, default: &str| {
+        let mut all: Vec<u64> = trained.as_array().into_iter().flatten().filter_map(Value::as_u64).collect();
+        all.extend(config["sampler"][default].as_u64());
+        all.sort_unstable();
+        all.dedup();
+        all
+    };
+    let missing = config["missing_trained"].as_object().into_iter().flatten().filter(|(_, trained)| **trained == json!(true));
+    json!({
+        "action_horizon": with_default(&config["action_horizons_trained"], "action_horizon"),
+        "sub_steps": with_default(&config["sub_steps_trained"], "sub_steps"),
+        "kappa above 0": config["refined"],
+        "histories without": missing.map(|(part, _)| part).collect::<Vec<_>>(),
+    })
 }
 
 /// Words and numbers without JSON's marks; null is what stands for infinity there.

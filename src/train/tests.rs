@@ -9,7 +9,7 @@ use super::{
 use crate::model::checkpoint;
 use std::{
     fs,
-    path::Path,
+    path::{Path, PathBuf},
     sync::{Arc, atomic::AtomicBool},
 };
 
@@ -23,7 +23,7 @@ pub(super) fn recipe_with(overrides: &[&str]) -> Result<Recipe, super::recipe::R
 }
 
 /// A run in a thread with the stack that backward needs.
-fn train(overrides: &[&str], out: &Path, stop_after_steps: Option<usize>) -> anyhow::Result<Outcome> {
+pub(super) fn train(overrides: &[&str], out: &Path, stop_after_steps: Option<usize>) -> anyhow::Result<Outcome> {
     train_as(overrides, options(out, stop_after_steps))
 }
 
@@ -32,19 +32,19 @@ fn train_within(data_memory_mib: Option<u64>, overrides: &[&str], out: &Path, st
     train_as(overrides, Options { data_memory_mib, ..options(out, stop_after_steps) })
 }
 
-fn options(out: &Path, stop_after_steps: Option<usize>) -> Options {
+pub(super) fn options(out: &Path, stop_after_steps: Option<usize>) -> Options {
     let stop = Arc::new(AtomicBool::new(false));
     let out = out.to_path_buf();
     Options { out, stop_after_steps, keep_best: false, stop, data_memory_mib: None, clock: Box::new(|| 0.0) }
 }
 
-fn train_as(overrides: &[&str], options: Options) -> anyhow::Result<Outcome> {
+pub(super) fn train_as(overrides: &[&str], options: Options) -> anyhow::Result<Outcome> {
     let recipe = recipe_with(overrides).unwrap();
     let worker = std::thread::Builder::new().stack_size(64 << 20).spawn(move || run(recipe, options)).unwrap();
     worker.join().unwrap()
 }
 
-fn shipped(dir: &Path) -> [Vec<u8>; 2] {
+pub(super) fn shipped(dir: &Path) -> [Vec<u8>; 2] {
     ["model.safetensors", "config.json"].map(|name| fs::read(dir.join(name)).unwrap())
 }
 
@@ -150,133 +150,12 @@ fn the_gate_restarts_stage_1_and_gives_up() {
     assert!(log.contains("\"attempt\":1"));
 }
 
-/// "Another recipe or seed", and the user had to find the key. Now each key that may not differ is named with both values.
-#[test]
-fn a_state_of_another_recipe_is_refused_by_key() {
-    let dir = tempfile::tempdir().unwrap();
-    train(&[], dir.path(), Some(12)).unwrap();
-    let refusal = |overrides: &[&str]| train(overrides, dir.path(), Some(1)).unwrap_err().to_string();
-    let error = refusal(&["stage2.batch=5", "seed=4"]);
-    assert!(error.contains("another recipe: `seed` was 3 and is 4, `stage2.batch` was 4 and is 5;"), "{error}");
-    let error = refusal(&["stage1.steps=20"]);
-    assert!(error.contains("`stage1.steps` was 9 and is 20, but stage1 is over"), "{error}");
-    let error = refusal(&["stage2.steps=2"]);
-    assert!(error.contains("`stage2.steps` was 9 and is 2, but stage2 has done 3 steps already"), "{error}");
-    assert!(refusal(&["sampler.temperature=0.25"]).contains("ada-trainer defaults"));
-    let error = refusal(&["data=\"tests/golden/data_f64.h5\""]);
-    assert!(error.contains("another data set"), "{error}");
-}
-
-/// How often something is written, and where the data set lies, changes no bit; a resume was refused for it.
-#[test]
-fn a_run_goes_on_with_another_log_and_a_moved_data_set() {
-    let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
-    train(&[], dirs[0].path(), None).unwrap();
-    train(&[], dirs[1].path(), Some(7)).unwrap();
-    let moved = dirs[1].path().join("moved.h5");
-    fs::copy("tests/golden/data_good.h5", &moved).unwrap();
-    let data = format!("data={:?}", moved.to_str().unwrap());
-    assert_eq!(train(&[&data, "log_every=1", "checkpoint_every=3"], dirs[1].path(), None).unwrap(), Outcome::Finished);
-    assert!(shipped(dirs[0].path()) == shipped(dirs[1].path()), "the weights differ");
-}
-
-/// More steps for a run under way, and for one that was finished: it goes on, and the checkpoint tells it.
-#[test]
-fn a_run_goes_on_with_more_steps_and_says_so() {
-    let dir = tempfile::tempdir().unwrap();
-    train(&[], dir.path(), Some(12)).unwrap();
-    assert_eq!(train(&["stage2.steps=12"], dir.path(), None).unwrap(), Outcome::Finished);
-    assert_eq!(train(&["stage2.steps=14"], dir.path(), None).unwrap(), Outcome::Finished);
-    let metrics = checkpoint::load_manifest(dir.path()).unwrap().0.provenance.metrics;
-    assert_eq!(metrics["steps"], 14);
-    let changes = serde_json::json!([
-        {"key": "stage2.steps", "from": 9, "to": 12, "at": 3},
-        {"key": "stage2.steps", "from": 12, "to": 14, "at": 12},
-    ]);
-    assert_eq!(metrics["changed_under_way"], changes);
-    // Changed before its stage began, it is the run that a fresh start would be.
-    let fresh = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
-    train(&[], fresh[0].path(), Some(4)).unwrap();
-    train(&["stage2.steps=5"], fresh[0].path(), None).unwrap();
-    train(&["stage2.steps=5"], fresh[1].path(), None).unwrap();
-    assert!(shipped(fresh[0].path()) == shipped(fresh[1].path()));
-    let metrics = checkpoint::load_manifest(fresh[0].path()).unwrap().0.provenance.metrics;
-    assert_eq!(metrics["changed_under_way"], serde_json::Value::Null);
-}
-
-/// Lines of the log that have this key: step and value.
-fn curve(dir: &Path, key: &str) -> Vec<(u64, f64)> {
-    let text = fs::read_to_string(dir.join("training/log.jsonl")).unwrap();
-    let lines = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
-    lines.filter_map(|line| Some((line["step"].as_u64().unwrap(), line[key].as_f64()?))).collect()
-}
-
-/// The log had training losses alone. Now both stages have a held-out loss at every checkpoint and at their ends, and the bits do not
-/// depend on how often it is taken.
-#[test]
-fn held_out_losses_are_logged_and_change_nothing() {
-    let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
-    train(&[], dirs[0].path(), None).unwrap();
-    train(&["checkpoint_every=2"], dirs[1].path(), None).unwrap();
-    assert!(shipped(dirs[0].path()) == shipped(dirs[1].path()), "the weights differ");
-    let steps = |key| curve(dirs[0].path(), key).iter().map(|(step, _)| *step).collect::<Vec<_>>();
-    assert_eq!((steps("held_out_elbo"), steps("held_out_loss")), (vec![4, 8, 9], vec![4, 8, 9]));
-    let often = curve(dirs[1].path(), "held_out_loss");
-    assert!(curve(dirs[0].path(), "held_out_loss").iter().all(|point| often.contains(point)), "{often:?}");
-}
-
-/// The last checkpoint need not be the best; with `--keep-best`, that of the least held-out loss stays beside it, also over a stop.
-#[test]
-fn the_best_checkpoint_is_kept_beside_the_last() {
-    let dir = tempfile::tempdir().unwrap();
-    let out = dir.path().join("run");
-    // A rate that only does harm after a while.
-    let overrides = ["checkpoint_every=1", "stage2.learning_rate.peak=1.0", "stage2.learning_rate.end=1.0", "stage2.steps=8"];
-    for stop in [Some(13), None] {
-        train_as(&overrides, Options { keep_best: true, ..options(&out, stop) }).unwrap();
-    }
-    let losses = curve(&out, "held_out_loss");
-    let least = losses.iter().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
-    let steps = |dir: &Path| checkpoint::load_manifest(dir).unwrap().0.provenance.metrics["steps"].as_u64().unwrap();
-    assert_eq!((steps(&dir.path().join("run-best")), steps(&out)), (least.0, 8), "{losses:?}");
-    checkpoint::load(&dir.path().join("run-best")).unwrap();
-}
-
 /// Held-out contexts that never change made the gate's error 0/0, which passed no bound: four attempts, then "more data or steps".
 #[test]
 fn a_gate_on_constant_contexts_says_so() {
     let gate = ["data=\"tests/golden/data_still.h5\"", "gate.filter=0.5", "gate.successor_state=0.5", "gate.tries=4"];
     let error = Task::new(recipe_with(&gate).unwrap(), &Room::default()).err().unwrap().to_string();
     assert!(error.contains("`gate`") && error.contains("never changes"), "{error}");
-}
-
-/// `defaults X X` with a bad value destroyed X.
-#[test]
-fn bad_defaults_leave_the_checkpoint_as_it_was() {
-    let dir = tempfile::tempdir().unwrap();
-    let files = ["config.json", "model.safetensors", "manifest.json"];
-    for name in files {
-        fs::copy(Path::new("models/tiny").join(name), dir.path().join(name)).unwrap();
-    }
-    let set = |text: &str| {
-        let overrides = vec![text.to_string()];
-        super::defaults::defaults(&super::flags::Defaults { checkpoint: dir.path().into(), out: dir.path().into(), overrides })
-    };
-    for (text, words) in [
-        ("restart.latent_jump=-1", "restart.latent_jump: is -1"),
-        ("restart.cold_distance=\"NaN\"", "restart.cold_distance"),
-        ("sampler.kappa=-0.1", "sampler.kappa"),
-        ("sampler.sub_steps=2305843009213693953", "sampler.sub_steps"),
-        ("sampler.action_horizon=many", "sampler.action_horizon"),
-    ] {
-        let error = set(text).unwrap_err().to_string();
-        assert!(error.contains(words), "{text}: {error}");
-        checkpoint::load(dir.path()).unwrap();
-        let same = |name: &&str| fs::read(dir.path().join(name)).unwrap() == fs::read(Path::new("models/tiny").join(name)).unwrap();
-        assert!(files.iter().all(same), "{text}");
-    }
-    set("restart.latent_jump=inf").unwrap();
-    assert!(checkpoint::load(dir.path()).unwrap().config().restart.latent_jump.is_infinite());
 }
 
 #[test]
@@ -302,6 +181,20 @@ fn wrong_recipes_name_the_key() {
     }
     let missing = recipe_with(&["model.latent=3"]).unwrap_err().to_string();
     assert!(missing.contains("latent"), "{missing}");
+}
+
+/// The recipes that ship with the repository are read and checked by the same code.
+#[test]
+fn shipped_recipes_are_right() {
+    let mut count = 0;
+    for entry in fs::read_dir("models").unwrap() {
+        let path: PathBuf = entry.unwrap().path().join("recipe.toml");
+        if path.exists() {
+            Recipe::read(&path, &[], None).unwrap_or_else(|error| panic!("{error}"));
+            count += 1;
+        }
+    }
+    assert!(count >= 3);
 }
 
 fn split(file: &str) -> Split {
@@ -346,7 +239,7 @@ fn data_sets_are_read_and_split() {
     assert_ne!(digests[0].digest, digests[1].digest);
 }
 
-/// All rows were held in memory, more than once, so a data set larger than that could not be trained on. Kept in a file they give the
+/// All rows were held in memory, four times over, so a data set larger than that could not be trained on. Kept in a file they give the
 /// same weights, config and log, over a stop too, and nothing is left behind.
 #[test]
 fn rows_in_a_file_train_the_same_bits() {

@@ -90,6 +90,15 @@ fn unsafe_stays_in_the_kernels() {
     hold(&["unsafe"], &["model/nn/kernels/"]);
 }
 
+/// An error whose text holds its source must not hand it out as well: the programs tell a chain of causes, and told such a one twice
+/// ("No such file or directory (os error 2): No such file or directory (os error 2)").
+#[test]
+fn a_cause_is_told_once() {
+    let twice = |code: &str| code.lines().any(|line| line.contains("#[error(") && line.contains("{source"));
+    let found: Vec<_> = code().into_iter().filter(|(_, code)| twice(code)).map(|(path, _)| path).collect();
+    assert_eq!(found, Vec::<String>::new(), "name the field `reason`");
+}
+
 /// The search itself finds what it looks for.
 #[test]
 fn the_search_is_awake() {

@@ -151,13 +151,16 @@ fn file_names_are_taken_as_they_are() {
 fn probe_and_inspect_say_what_a_checkpoint_is() {
     let out = tempfile::tempdir().unwrap();
     let dir = out.path().to_str().unwrap();
-    assert!(ask(&["run", RECIPE, "--out", dir, "--seed", "5"]).status.success());
+    assert!(ask(&["run", RECIPE, "--out", dir, "--seed", "5", "--set", "sampler.temperature=0.1"]).status.success());
     let text = String::from_utf8(ask(&["inspect", dir]).stdout).unwrap();
     assert!(text.contains("digest") && text.contains("seed        5") && text.contains("[stage2]"), "{text}");
     // What is in force was told as JSON, and of the restart nothing at all.
-    for words in
-        ["kappa inf, latent mean", "restart     cold_distance 1.5, latent_jump 1", "refinement (kappa above 0) true, sub_steps [2]"]
-    {
+    for words in [
+        "kappa inf, latent mean",
+        "temperature 0.1\n",
+        "restart     cold_distance 1.5, latent_jump 1",
+        "trained for action_horizon [2], histories without [action, reward, state], kappa above 0 true, sub_steps [2]",
+    ] {
         assert!(text.contains(words), "{words}: {text}");
     }
     let value: serde_json::Value = serde_json::from_slice(&ask(&["inspect", dir, "--json"]).stdout).unwrap();

@@ -50,10 +50,9 @@ impl Files {
         let parsed = Manifest::parse(&dir.join(MANIFEST), &manifest)?;
         let part = |name, bytes_max| {
             let path = dir.join(name);
-            let found = read(&path, bytes_max).and_then(|bytes| parsed.check_digest(name, &path, bytes));
-            // Only the reason why `NAME` itself is not it is told: `NAME.next` is hardly ever there.
-            let beside = || read(&next(dir, name), bytes_max).and_then(|bytes| parsed.check_digest(name, &path, bytes)).ok();
-            found.or_else(|error| beside().ok_or(error))
+            let found = |from: &Path| read(from, bytes_max).and_then(|bytes| parsed.check_digest(name, &path, bytes));
+            // `NAME.next` may have become `NAME` in between. Only the reason why `NAME` was not it is told: `NAME.next` is hardly ever there.
+            found(&path).or_else(|error| found(&next(dir, name)).or_else(|_| found(&path)).map_err(|_| error))
         };
         Ok(Self { config: part(CONFIG, HEADER_BYTES_MAX)?, weights: part(WEIGHTS, WEIGHT_BYTES_MAX)?, manifest })
     }

@@ -49,8 +49,9 @@ impl Layers {
 
     /// Every key of the file.
     pub fn file(&mut self, path: &Path) -> Result<(), ConfigError> {
-        let text = fs::read_to_string(path).map_err(|source| ConfigError::File { path: path.to_owned(), source })?;
-        let table: Table = text.parse().map_err(|source| ConfigError::Toml { path: path.to_owned(), source: Box::new(source) })?;
+        let text = fs::read_to_string(path).map_err(|error| ConfigError::File { path: path.to_owned(), reason: error.to_string() })?;
+        let table: Table =
+            text.parse().map_err(|error: toml::de::Error| ConfigError::Toml { path: path.to_owned(), reason: error.to_string() })?;
         let origin = Origin::File(path.to_owned());
         for (section, value) in table {
             match value {

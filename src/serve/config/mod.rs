@@ -9,7 +9,7 @@ pub use layers::Origin;
 use crate::model::nn::Precision;
 use layers::Layers;
 use serde::{Deserialize, Serialize};
-use std::{env, ffi::OsString, io, net::Ipv6Addr, path::Path, path::PathBuf, thread};
+use std::{env, ffi::OsString, net::Ipv6Addr, path::Path, path::PathBuf, thread};
 
 /// All settings; each section documents its own.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -244,20 +244,20 @@ impl Default for TelemetryConfig {
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("{path}: {source}")]
+    #[error("{path}: {reason}")]
     File {
         /// The file.
         path: PathBuf,
         /// What the system said.
-        source: io::Error,
+        reason: String,
     },
     /// The file is not TOML.
-    #[error("{path}: {source}")]
+    #[error("{path}: {reason}")]
     Toml {
         /// The file.
         path: PathBuf,
         /// Where and why.
-        source: Box<toml::de::Error>,
+        reason: String,
     },
     /// There is no such key.
     #[error("{key}: no such setting; {known} ({origin})")]
