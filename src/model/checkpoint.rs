@@ -1,7 +1,7 @@
 //! config.json + model.safetensors + manifest.json <-> [`Agent`]; the only file access of this room.
 //!
 //! safetensors itself accepts NaN, flipped bits and an 88 MB header, so everything is checked against the manifest, and the networks
-//! must ask for exactly the tensors that are there. Then one act is tried: finite weights can still give numbers that are not.
+//! must ask for exactly the tensors that are there. What is written is also asked for an act: finite weights can give numbers that are not.
 mod files;
 
 use crate::model::{
@@ -124,9 +124,17 @@ impl Manifest {
 /// the place, in one step. Whatever goes wrong, and whenever the process is killed, `dir` holds the old checkpoint or the new one.
 ///
 /// # Errors
-/// If a file cannot be written, or what was written would not [`load`].
+/// If a file cannot be written, or what was written would not [`load`] or not act.
 pub fn save(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>, provenance: &Provenance) -> Result<(), CheckpointError> {
-    encode(dir, config, tensors, provenance)?.replace(dir, |written| agent(dir, written, Precision::F32).map(|_| ()))
+    let verify = |written: &Files| first_act(&agent(dir, written, Precision::F32)?).map_err(|reason| invalid(&dir.join(WEIGHTS), reason));
+    encode(dir, config, tensors, provenance)?.replace(dir, verify)
+}
+
+/// Whether an act comes out of it, of the mean state. A loader does not ask: with many levels an act takes long, and who loads acts anyway.
+fn first_act(agent: &Agent) -> Result<(), String> {
+    let mean = Observation { state: agent.config().normalizer.state.mean.clone(), ..Observation::default() };
+    let act = agent.open(0, &agent.config().sampler).and_then(|episode| agent.act(&episode, &mean));
+    act.map(|_| ()).map_err(|error| format!("a first act fails: {error}"))
 }
 
 fn encode(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>, provenance: &Provenance) -> Result<Files, CheckpointError> {
@@ -142,7 +150,7 @@ fn encode(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>, 
 /// Reads, checks and builds the agent in this directory.
 ///
 /// # Errors
-/// If a file is missing, a digest differs, a tensor is missing, superfluous, of another shape, or not finite, or an act is not finite.
+/// If a file is missing, a digest differs, a tensor is missing, superfluous, of another shape, or not finite.
 pub fn load(dir: &Path) -> Result<Agent, CheckpointError> {
     load_as(dir, Precision::F32)
 }
@@ -180,11 +188,7 @@ fn agent(dir: &Path, files: &Files, precision: Precision) -> Result<Agent, Check
     if let Some(name) = params.unused().first() {
         return Err(invalid(&path, format!("tensor {name} belongs to no network of {CONFIG}")));
     }
-    let agent = Agent::new(config, networks, sha256(&files.manifest));
-    let first = Observation { state: agent.config().normalizer.state.mean.clone(), ..Observation::default() };
-    let act = agent.open(0, &agent.config().sampler).and_then(|episode| agent.act(&episode, &first));
-    act.map_err(|error| invalid(&path, format!("a first act fails: {error}")))?;
-    Ok(agent)
+    Ok(Agent::new(config, networks, sha256(&files.manifest)))
 }
 
 /// Writes the checkpoint of `dir` into `out` (it may be the same) with the same weights and origin and another configuration, e.g. other

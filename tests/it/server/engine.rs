@@ -1,10 +1,12 @@
 //! The engine by itself: a poisoned batch, and the end.
 
-use super::{models_dir, save};
+use super::models_dir;
 use ada_diffuser::{
     model::{
+        Networks,
         agent::{Agent, Observation},
-        checkpoint,
+        checkpoint::{self, Provenance},
+        nn::params::Params,
         normalizer::Affine,
     },
     serve::engine::{Engine, EngineOptions, Failure, Finished, Job, Question, Refusal, Ticket},
@@ -55,7 +57,10 @@ fn narrow(dir: &Path) -> Agent {
     config.layout.state_dim -= 1;
     config.normalizer.state = Affine::identity(config.layout.state_dim);
     config.normalizer.state_change_std.pop();
-    save(dir, &config, 1.0);
+    let params = Params::fresh(7);
+    Networks::new(&config, &params).unwrap();
+    let tensors = params.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
+    checkpoint::save(dir, &config, &tensors, &Provenance::default()).unwrap();
     checkpoint::load(dir).unwrap()
 }
 
