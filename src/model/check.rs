@@ -10,7 +10,6 @@ use crate::model::{
     latent::LatentConfig,
     nn::{params::Params, plain},
 };
-use std::collections::BTreeSet;
 
 /// Generated positions of a window.
 const PLAN_HORIZON_MAX: usize = 1024;
@@ -77,13 +76,12 @@ impl ModelConfig {
         let SamplerOptions { streaming: _, action_horizon, sub_steps, eta, temperature, kappa, latent: _ } = options;
         holds((1..=horizon).contains(action_horizon), "action_horizon", &|| format!("{action_horizon} is outside 1..={horizon}"))?;
         Ladder::new(horizon, *sub_steps, self.level_max).map_err(|reason| ("sub_steps", reason))?;
-        let trained = self.sub_steps_trained.contains(sub_steps) || *sub_steps == self.sampler.sub_steps;
-        holds(trained, "sub_steps", &|| format!("this checkpoint was not trained for the levels of {sub_steps} sub-steps a rung"))?;
-        let horizons = &self.action_horizons_trained;
-        let trained = horizons.contains(action_horizon) || *action_horizon == self.sampler.action_horizon;
-        holds(trained, "action_horizon", &|| {
-            let all: BTreeSet<usize> = horizons.iter().copied().chain([self.sampler.action_horizon]).collect();
-            format!("this checkpoint was trained for chunks of {all:?} actions, not {action_horizon}")
+        let trained = self.trained();
+        holds(trained.sub_steps.contains(sub_steps), "sub_steps", &|| {
+            format!("this checkpoint was trained for the levels of {:?} sub-steps a rung, not {sub_steps}", trained.sub_steps)
+        })?;
+        holds(trained.action_horizons.contains(action_horizon), "action_horizon", &|| {
+            format!("this checkpoint was trained for chunks of {:?} actions, not {action_horizon}", trained.action_horizons)
         })?;
         holds((0.0..=1.0).contains(eta), "eta", &|| format!("{eta} is outside 0..=1"))?;
         let warm = (0.0..=TEMPERATURE_MAX).contains(temperature);

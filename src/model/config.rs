@@ -8,6 +8,7 @@ use crate::model::{
     trajectory::Layout,
 };
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 
 /// Architecture, units and sampling defaults of one model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -53,6 +54,17 @@ pub struct ModelConfig {
     pub restart: Restart,
     /// Sampling defaults.
     pub sampler: SamplerOptions,
+}
+
+/// What training covered: what a session may ask for and leave out.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Trained {
+    /// Actions per chunk (T_a), ascending.
+    pub action_horizons: Vec<usize>,
+    /// Sub-steps per rung (n), ascending.
+    pub sub_steps: Vec<usize>,
+    /// Fields of the history.
+    pub missing: Missing,
 }
 
 /// Fields of the history that may be missing at an act.
@@ -117,6 +129,19 @@ impl ModelConfig {
             latent_spread: 1.0,
             restart: Restart::default(),
             sampler: SamplerOptions::default(),
+        }
+    }
+
+    /// What training covered, the sampling defaults among it.
+    pub fn trained(&self) -> Trained {
+        let all = |beside: &[usize], default: usize| {
+            let all: BTreeSet<usize> = beside.iter().copied().chain([default]).collect();
+            all.into_iter().collect()
+        };
+        Trained {
+            action_horizons: all(&self.action_horizons_trained, self.sampler.action_horizon),
+            sub_steps: all(&self.sub_steps_trained, self.sampler.sub_steps),
+            missing: self.missing_trained,
         }
     }
 

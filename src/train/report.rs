@@ -84,6 +84,7 @@ pub fn inspect(dir: &Path) -> Result<Value> {
         "parameters": {"latent": parameters("latent."), "denoiser": parameters("denoiser.")},
         // By way of text, where a number of 32 bits has the digits that a person gave it.
         "config": serde_json::from_str::<Value>(&serde_json::to_string(agent.config())?)?,
+        "trained": agent.config().trained(),
         "provenance": manifest.provenance,
     }))
 }
@@ -97,7 +98,7 @@ pub fn inspect_text(value: &Value) -> String {
     let (config, provenance) = (&value["config"], &value["provenance"]);
     let pair = |name: &str, value: &Value| format!("{name:<11} {}\n", told(value));
     let mut text = pair("digest", &value["digest"]) + &pair("sampler", &config["sampler"]) + &pair("restart", &config["restart"]);
-    text += &pair("trained for", &trained(config));
+    text += &pair("trained for", &trained(value));
     for (key, value) in config.as_object().into_iter().flatten().filter(|(key, _)| !NOT_LISTED.contains(&key.as_str())) {
         text += &if key == "latent" && value.is_null() { pair(key, &"none".into()) } else { pair(key, value) };
     }
@@ -110,20 +111,14 @@ pub fn inspect_text(value: &Value) -> String {
     text + note + &indent(provenance["recipe"].as_str().unwrap_or_default())
 }
 
-/// What training covered: the default and what a session may ask for beside it.
-fn trained(config: &Value) -> Value {
-    let with_default = |trained: &Value, default: &str| {
-        let mut all: Vec<u64> = trained.as_array().into_iter().flatten().filter_map(Value::as_u64).collect();
-        all.extend(config["sampler"][default].as_u64());
-        all.sort_unstable();
-        all.dedup();
-        all
-    };
-    let missing = config["missing_trained"].as_object().into_iter().flatten().filter(|(_, trained)| **trained == json!(true));
+/// What training covered, for people.
+fn trained(value: &Value) -> Value {
+    let (trained, refined) = (&value["trained"], &value["config"]["refined"]);
+    let missing = trained["missing"].as_object().into_iter().flatten().filter(|(_, missing)| **missing == json!(true));
     json!({
-        "action_horizon": with_default(&config["action_horizons_trained"], "action_horizon"),
-        "sub_steps": with_default(&config["sub_steps_trained"], "sub_steps"),
-        "kappa above 0": config["refined"],
+        "action_horizon": trained["action_horizons"],
+        "sub_steps": trained["sub_steps"],
+        "kappa above 0": refined,
         "histories without": missing.map(|(part, _)| part).collect::<Vec<_>>(),
     })
 }

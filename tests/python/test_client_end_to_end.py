@@ -125,6 +125,7 @@ def test_what_a_client_must_know(client: Client) -> None:
     assert client.model().digest == client.model(f"tiny@{tiny.digest[:8]}").digest == tiny.digest
     assert len(tiny.action_low) == len(tiny.action_high) == tiny.action_dim
     assert len(tiny.sampler.given()) == 7, "every default is said"
+    assert tiny.sampler.action_horizon in tiny.trained.action_horizons and tiny.trained.missing.reward
     wanted = SamplerOptions(streaming=False, temperature=0.5, latent="sample", kappa=0.0)
     with client.open_session(seed=2**53 - 1, options=wanted, ttl_ms=60_000) as session:
         assert session.seed == 2**53 - 1
@@ -301,6 +302,17 @@ def test_rollouts_are_the_same_by_both_faces_alone_and_in_a_batch(address: str) 
             assert result.acts.acts == 2 * 200 / result.options.action_horizon and result.acts.replayed == 0
             assert {session.session_id for session in client.sessions()} <= before, "a rollout closes its sessions"
     assert returns["grpc alone"] == returns["http alone"] == returns["batch"]
+
+
+def test_rewards_are_withheld_when_asked(address: str) -> None:
+    """What a model is worth without rewards could only be measured by a script that patched the client."""
+    with Client(f"grpc://{address}") as client:
+        told, withheld = (
+            evaluate(client, Trial("point-wind-s", episodes=2, seed=3, vector=2, withhold_rewards=withhold)) for withhold in (False, True)
+        )
+    assert withheld.as_json()["withhold_rewards"] and len(withheld.episodes[0].rewards) == 200, "they are counted all the same"
+    assert told.episodes[0].actions[0].tolist() == withheld.episodes[0].actions[0].tolist(), "nothing is told before the first act"
+    assert told.returns.tolist() != withheld.returns.tolist()
 
 
 def test_an_environment_that_does_not_fit_is_refused(client: Client) -> None:

@@ -15,7 +15,7 @@ from ada_diffuser import SamplerOptions, environments
 from ada_diffuser.commands import evaluate as evaluate_command
 from ada_diffuser.commands import parse_settings, server_url
 from ada_diffuser.commands import rollout as rollout_command
-from ada_diffuser.messages import Model, Timings
+from ada_diffuser.messages import Missing, Model, Timings, Trained
 from ada_diffuser.rollout import ActLog, Episode, Evaluation, Trial
 from ada_diffuser.rollout.film import save_film
 from ada_diffuser.rollout.plot import save_plot
@@ -49,7 +49,8 @@ def finished(env_name: str, episodes: list[Episode]) -> Evaluation:
     acts.call_ms, acts.acts, acts.evaluations, acts.timings = [1.0, 3.0], 2, 9, [Timings(1000, 2000, 3000, 6000)]
     box = np.ones(1, np.float32)
     options = SamplerOptions(streaming=True, kappa=float("inf"))
-    model = Model("fake", "ab" * 32, True, 1, 1, 8, 4, 1, 2, 10, -box, box, options, True)
+    trained = Trained((1,), (1,), Missing(state=False, action=False, reward=False))
+    model = Model("fake", "ab" * 32, True, 1, 1, 8, 4, 1, 2, 10, -box, box, options, True, trained)
     return Evaluation(Trial(env_name, episodes=len(episodes)), model, options, episodes, acts, 1.0)
 
 

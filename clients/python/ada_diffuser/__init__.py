@@ -23,11 +23,13 @@ from ada_diffuser.errors import (
 from ada_diffuser.messages import (
     Chunk,
     Executed,
+    Missing,
     Model,
     Observation,
     SamplerOptions,
     SessionSummary,
     Timings,
+    Trained,
 )
 from ada_diffuser.retry import RetryPolicy
 
@@ -42,6 +44,7 @@ __all__ = [
     "DeadlineExceeded",
     "Executed",
     "InvalidInput",
+    "Missing",
     "Model",
     "NotFound",
     "Observation",
@@ -56,6 +59,7 @@ __all__ = [
     "StepConflict",
     "Timings",
     "TooLarge",
+    "Trained",
     "Unavailable",
     "UnexpectedAnswer",
 ]

@@ -200,6 +200,26 @@ class Chunk:
     degraded: bool
 
 
+@dataclass(frozen=True)
+class Missing:
+    """Parts of an executed step that may be missing without being guessed; otherwise a missing reward is taken to be the mean one."""
+
+    state: bool
+    action: bool
+    reward: bool
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a session may ask for and leave out, because training did so too."""
+
+    #: Chunk lengths (T_a), ascending.
+    action_horizons: tuple[int, ...]
+    #: Sub-steps per rung, ascending.
+    sub_steps: tuple[int, ...]
+    missing: Missing
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """What a client must know of a model."""
@@ -220,6 +240,7 @@ class Model:
     sampler: SamplerOptions
     #: Whether it was trained with zig-zag refinement; without it `kappa` other than 0 is refused.
     refined: bool
+    trained: Trained
 
 
 @dataclass(frozen=True, eq=False)

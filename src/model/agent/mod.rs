@@ -41,6 +41,7 @@ impl Agent {
             action_high: config.action_high.clone(),
             sampler: config.sampler.clone(),
             refined: config.refined,
+            trained: config.trained(),
             digest,
         };
         Self { process: Process::cosine(config.level_max), config, networks, spec }

@@ -1,6 +1,6 @@
 //! What goes into an agent and comes out of it: options, observations, chunks, errors.
 
-use crate::model::{nn::plain, trajectory::Layout};
+use crate::model::{config::Trained, nn::plain, trajectory::Layout};
 use serde::{Deserialize, Serialize};
 
 /// How a chunk is sampled; a checkpoint holds defaults chosen on validation episodes, a session may override them.
@@ -63,6 +63,8 @@ pub struct Spec {
     pub sampler: SamplerOptions,
     /// Whether the network was trained with the refinement that zig-zag does (a server refuses zig-zag otherwise).
     pub refined: bool,
+    /// What a session may ask for and leave out.
+    pub trained: Trained,
     /// SHA-256 of the checkpoint's manifest, hex.
     pub digest: String,
 }

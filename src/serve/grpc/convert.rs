@@ -2,7 +2,10 @@
 
 use super::pb;
 use crate::{
-    model::agent::{Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start},
+    model::{
+        agent::{Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start},
+        config::{Missing, Trained},
+    },
     serve::{
         error::ServiceError,
         registry::Model,
@@ -173,8 +176,20 @@ fn sampler_options(options: &SamplerOptions) -> pb::SamplerOptions {
 
 pub fn model(model: &Model) -> pb::Model {
     let Model { name, agent, is_default } = model;
-    let Spec { layout, plan_horizon, block_len, obs_horizon, latent_dim, level_max, action_low, action_high, sampler, refined, digest } =
-        agent.spec();
+    let Spec {
+        layout,
+        plan_horizon,
+        block_len,
+        obs_horizon,
+        latent_dim,
+        level_max,
+        action_low,
+        action_high,
+        sampler,
+        refined,
+        trained,
+        digest,
+    } = agent.spec();
     pb::Model {
         name: name.to_string(),
         digest: digest.clone(),
@@ -190,5 +205,16 @@ pub fn model(model: &Model) -> pb::Model {
         action_high: action_high.clone(),
         sampler: Some(sampler_options(sampler)),
         refined: *refined,
+        trained: Some(self::trained(trained)),
+    }
+}
+
+fn trained(trained: &Trained) -> pb::Trained {
+    let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward } } = trained;
+    let lengths = |lengths: &[usize]| lengths.iter().map(|length| *length as u32).collect();
+    pb::Trained {
+        action_horizons: lengths(action_horizons),
+        sub_steps: lengths(sub_steps),
+        missing: Some(pb::Missing { state: *state, action: *action, reward: *reward }),
     }
 }

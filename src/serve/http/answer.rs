@@ -2,7 +2,10 @@
 
 use super::{json::OptionsBody, problem::Problem};
 use crate::{
-    model::agent::{Chunk, Spec, Start},
+    model::{
+        agent::{Chunk, Spec, Start},
+        config::{Missing, Trained},
+    },
     serve::{
         registry::Model,
         request::{ActResult, Acted},
@@ -182,13 +185,49 @@ pub struct ModelAnswer {
     action_high: Vec<f32>,
     sampler: OptionsBody,
     refined: bool,
+    trained: TrainedAnswer,
+}
+
+/// What a session may ask for and leave out, because training did so too.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct TrainedAnswer {
+    action_horizons: Vec<usize>,
+    sub_steps: Vec<usize>,
+    missing: MissingAnswer,
+}
+
+/// Parts of an executed step that may be missing without being guessed.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct MissingAnswer {
+    state: bool,
+    action: bool,
+    reward: bool,
+}
+
+impl From<Trained> for TrainedAnswer {
+    fn from(trained: Trained) -> Self {
+        let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward } } = trained;
+        Self { action_horizons, sub_steps, missing: MissingAnswer { state, action, reward } }
+    }
 }
 
 impl From<&Model> for ModelAnswer {
     fn from(model: &Model) -> Self {
         let Model { name, agent, is_default } = model;
-        let Spec { layout, plan_horizon, block_len, obs_horizon, latent_dim, level_max, action_low, action_high, sampler, refined, digest } =
-            agent.spec().clone();
+        let Spec {
+            layout,
+            plan_horizon,
+            block_len,
+            obs_horizon,
+            latent_dim,
+            level_max,
+            action_low,
+            action_high,
+            sampler,
+            refined,
+            trained,
+            digest,
+        } = agent.spec().clone();
         Self {
             name: name.to_string(),
             digest,
@@ -204,6 +243,7 @@ impl From<&Model> for ModelAnswer {
             action_high,
             sampler: (&sampler).into(),
             refined,
+            trained: trained.into(),
         }
     }
 }

@@ -228,6 +228,16 @@ async fn models_say_what_a_client_must_know() {
     assert_eq!((tiny.state_dim, tiny.action_dim, tiny.plan_horizon, tiny.latent_dim), (4, 2, 8, 6));
     let json = server.get(&format!("/v1/models/tiny@{}", &tiny.digest[..8])).await.json()["model"].clone();
     assert_eq!((json["digest"].as_str().unwrap(), json["sampler"]["latent"].as_str().unwrap()), (tiny.digest.as_str(), "mean"));
+    let trained = json["trained"].clone();
+    assert_eq!(trained["missing"], json!({"state": true, "action": true, "reward": true}));
+    let told = tiny.trained.clone().unwrap();
+    assert_eq!(trained["action_horizons"], json!(told.action_horizons));
+    assert!(told.missing.unwrap().reward && told.sub_steps.contains(&1));
+    for action_horizon in 1..=9 {
+        let body = json!({"model": "tiny", "options": {"action_horizon": action_horizon}});
+        let is_taken = server.post("/v1/sessions", &body).await.status == 201;
+        assert_eq!(is_taken, told.action_horizons.contains(&action_horizon), "what is said is what is taken: {action_horizon}");
+    }
     for wrong in ["tiny@ffffffffff", "tiny@", "nothing"] {
         let reply = server.get(&format!("/v1/models/{wrong}")).await;
         assert_eq!((reply.status, reply.reason().as_str()), (404, "MODEL_NOT_FOUND"), "{wrong}");

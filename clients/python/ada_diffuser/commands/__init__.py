@@ -25,6 +25,13 @@ def add_environment_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_trial_arguments(parser: argparse.ArgumentParser) -> None:
+    """How the server is asked."""
+    parser.add_argument(
+        "--withhold-rewards", action="store_true", help="do not report rewards: what is the model worth where nobody measures them?"
+    )
+
+
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:
     """Where the server is, and which face is used."""
     parser.add_argument("--url", default=DEFAULT_URL, help=f"host:port, grpc:// or http:// before it or not (default {DEFAULT_URL})")

@@ -13,6 +13,7 @@ from ada_diffuser.client import Client
 from ada_diffuser.commands import (
     add_environment_arguments,
     add_server_arguments,
+    add_trial_arguments,
     check_environment,
     parse_settings,
     run_command,
@@ -47,6 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("ada-evaluate", description=_ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_environment_arguments(parser)
     add_server_arguments(parser)
+    add_trial_arguments(parser)
     parser.add_argument("--models", default="", help="names, with commas between (default: the server's default model)")
     parser.add_argument("--episodes", type=int, default=50, help="episodes of each combination (default 50)")
     parser.add_argument("--seed", type=int, default=1000, help="seed of the first episode (default 1000)")
@@ -75,7 +77,16 @@ def _run(arguments: argparse.Namespace) -> None:
     from ada_diffuser.rollout.report import markdown
 
     trials = [
-        Trial(arguments.env, model, arguments.episodes, arguments.seed, arguments.vector, options, arguments.episode_steps)
+        Trial(
+            arguments.env,
+            model,
+            arguments.episodes,
+            arguments.seed,
+            arguments.vector,
+            options,
+            arguments.episode_steps,
+            withhold_rewards=arguments.withhold_rewards,
+        )
         for model in models
         for options in settings
     ]

@@ -12,6 +12,7 @@ from ada_diffuser.client import Client
 from ada_diffuser.commands import (
     add_environment_arguments,
     add_server_arguments,
+    add_trial_arguments,
     check_environment,
     parse_settings,
     run_command,
@@ -43,6 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("ada-rollout", description=_ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_environment_arguments(parser)
     add_server_arguments(parser)
+    add_trial_arguments(parser)
     parser.add_argument("--model", default="", help="name or name@digest (default: the server's default model)")
     parser.add_argument("--episodes", type=int, default=10, help="episodes to run (default 10)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
@@ -65,7 +67,16 @@ def _run(arguments: argparse.Namespace) -> None:
     from ada_diffuser.rollout.readout import fit
     from ada_diffuser.rollout.report import table
 
-    trial = Trial(arguments.env, arguments.model, arguments.episodes, arguments.seed, arguments.vector, options, arguments.episode_steps)
+    trial = Trial(
+        arguments.env,
+        arguments.model,
+        arguments.episodes,
+        arguments.seed,
+        arguments.vector,
+        options,
+        arguments.episode_steps,
+        withhold_rewards=arguments.withhold_rewards,
+    )
     with Client(server_url(arguments.url, arguments.face)) as client:
         client.wait_ready(arguments.wait)
         steps = trial.episodes * check(client, trial)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ada_diffuser.errors import AdaError, Cancelled, Detail, UnexpectedAnswer, from_detail
 from ada_diffuser.faces.proxy import Proxy
-from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary, Start, Timings
+from ada_diffuser.messages import ActCall, Chunk, Missing, Model, SamplerOptions, SessionSummary, Start, Timings, Trained
 from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
 from ada_diffuser.values import Floats
 
@@ -206,7 +206,13 @@ def _model(model: models_pb2.Model) -> Model:
         action_high=_floats(model.action_high),
         sampler=_options_in(model.sampler),
         refined=model.refined,
+        trained=_trained(model.trained),
     )
+
+
+def _trained(trained: models_pb2.Trained) -> Trained:
+    missing = Missing(trained.missing.state, trained.missing.action, trained.missing.reward)
+    return Trained(tuple(trained.action_horizons), tuple(trained.sub_steps), missing)
 
 
 def _summary(session: agent_pb2.Session) -> SessionSummary:

@@ -17,7 +17,7 @@ from urllib.parse import quote, urlencode
 import numpy as np
 
 from ada_diffuser.errors import AdaError, DeadlineExceeded, Detail, Unavailable, UnexpectedAnswer, from_detail
-from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary, Timings
+from ada_diffuser.messages import ActCall, Chunk, Missing, Model, SamplerOptions, SessionSummary, Timings, Trained
 from ada_diffuser.values import Floats
 
 T = TypeVar("T")
@@ -296,12 +296,15 @@ def _chunk(answer: Mapping[str, Any]) -> Chunk:
 
 
 def _model(model: Mapping[str, Any]) -> Model:
-    plain = {name: model[name] for name in Model.__dataclass_fields__ if name not in ("action_low", "action_high", "sampler")}
+    special = ("action_low", "action_high", "sampler", "trained")
+    plain = {name: model[name] for name in Model.__dataclass_fields__ if name not in special}
+    trained = model["trained"]
     return Model(
         **plain,
         action_low=_floats(model["action_low"]),
         action_high=_floats(model["action_high"]),
         sampler=_options_in(model["sampler"]),
+        trained=Trained(tuple(trained["action_horizons"]), tuple(trained["sub_steps"]), Missing(**trained["missing"])),
     )
 
 

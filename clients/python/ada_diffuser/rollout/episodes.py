@@ -24,8 +24,8 @@ Progress = Callable[[int], object]
 def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: None) -> Evaluation:
     """Runs the trial's episodes, in groups of `trial.vector`, in as many sessions.
 
-    Rewards are reported with the actions, since a latent may live off them. Raises the `AdaError` of the first act that
-    cannot be had, and ValueError where environment and model do not fit.
+    Rewards are reported with the actions, since a latent may live off them, unless the trial withholds them. Raises the
+    `AdaError` of the first act that cannot be had, and ValueError where environment and model do not fit.
     """
     started = time.monotonic()
     acts, episodes = ActLog(), []
@@ -45,8 +45,8 @@ def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: No
 class _Lane:
     """One environment and its session."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], broker: ChunkBroker) -> None:
-        self.env, self.broker = env, broker
+    def __init__(self, env: gymnasium.Env[Any, Any], broker: ChunkBroker, *, withhold_rewards: bool) -> None:
+        self.env, self.broker, self._withhold_rewards = env, broker, withhold_rewards
         self.done = True
         self.episode = Episode(seed=0)
         self.state = np.zeros(0, np.float32)
@@ -65,10 +65,10 @@ class _Lane:
         self.episode.latents.append(chunk.latent_mean)
 
     def step(self) -> None:
-        """Executes the next action of the chunk and reports its reward."""
+        """Executes the next action of the chunk and reports what came of it."""
         action = self.broker.take(self.state)
         observation, reward, terminated, truncated, facts = self.env.step(action)
-        self.broker.report(reward=float(reward))
+        self.broker.report(reward=None if self._withhold_rewards else float(reward))
         self.episode.states.append(self.state)
         self.episode.actions.append(action)
         self.episode.rewards.append(float(reward))
@@ -87,7 +87,7 @@ def _open_lanes(client: Client, trial: Trial, stack: ExitStack) -> list[_Lane]:
         stack.callback(env.close)
         session = stack.enter_context(client.open_session(trial.model, seed=trial.seed + slot, options=trial.options))
         _check_fit(trial.env, env, session.model)
-        lanes.append(_Lane(env, ChunkBroker(session)))
+        lanes.append(_Lane(env, ChunkBroker(session), withhold_rewards=trial.withhold_rewards))
     return lanes
 
 

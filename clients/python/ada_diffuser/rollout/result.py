@@ -28,6 +28,8 @@ class Trial:
     options: SamplerOptions = field(default_factory=SamplerOptions)
     #: Where episodes are truncated; None: where the environment is registered to be.
     episode_steps: int | None = None
+    #: Whether the agent is told no reward, as where nobody measures it.
+    withhold_rewards: bool = False
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.vector < 1 or self.seed < 0:
@@ -131,6 +133,7 @@ class Evaluation:
             "model_digest": self.model.digest,
             "seed": self.trial.seed,
             "vector": self.trial.vector,
+            "withhold_rewards": self.trial.withhold_rewards,
             "options": plain_options(asdict(self.options)),
             "returns": [round(value, 6) for value in self.returns.tolist()],
             "failed_seeds": [episode.seed for episode in self.episodes if episode.failed],

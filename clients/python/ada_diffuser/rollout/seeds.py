@@ -56,6 +56,7 @@ class SeedGroup:
             "model": self.recipe,
             "training_seeds": [result.model.name for result in self.results],
             "seed": first.seed,
+            "withhold_rewards": first.withhold_rewards,
             "options": plain_options(first.options.given()),
             "mean_returns": [round(result.mean_return, 6) for result in self.results],
             "mean_return": round(self.mean_return, 6),
@@ -77,6 +78,6 @@ def by_recipe(results: Sequence[Evaluation]) -> list[SeedGroup]:
         name, seeds = _SEED.subn("", result.model.name)
         if seeds:
             trial = result.trial
-            key = (name, trial.env, trial.seed, trial.episodes, trial.episode_steps, trial.options)
+            key = (name, trial.env, trial.seed, trial.episodes, trial.episode_steps, trial.withhold_rewards, trial.options)
             groups.setdefault(key, {})[result.model.name] = result
     return [SeedGroup(key[0], list(group.values())) for key, group in groups.items() if len(group) > 1]

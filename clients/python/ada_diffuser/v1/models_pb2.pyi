@@ -39,7 +39,7 @@ class GetModelResponse(_message.Message):
     def __init__(self, model: _Optional[_Union[Model, _Mapping]] = ...) -> None: ...
 
 class Model(_message.Message):
-    __slots__ = ("name", "digest", "is_default", "state_dim", "action_dim", "plan_horizon", "block_len", "obs_horizon", "latent_dim", "level_max", "action_low", "action_high", "sampler", "refined")
+    __slots__ = ("name", "digest", "is_default", "state_dim", "action_dim", "plan_horizon", "block_len", "obs_horizon", "latent_dim", "level_max", "action_low", "action_high", "sampler", "refined", "trained")
     NAME_FIELD_NUMBER: _ClassVar[int]
     DIGEST_FIELD_NUMBER: _ClassVar[int]
     IS_DEFAULT_FIELD_NUMBER: _ClassVar[int]
@@ -54,6 +54,7 @@ class Model(_message.Message):
     ACTION_HIGH_FIELD_NUMBER: _ClassVar[int]
     SAMPLER_FIELD_NUMBER: _ClassVar[int]
     REFINED_FIELD_NUMBER: _ClassVar[int]
+    TRAINED_FIELD_NUMBER: _ClassVar[int]
     name: str
     digest: str
     is_default: bool
@@ -68,7 +69,28 @@ class Model(_message.Message):
     action_high: _containers.RepeatedScalarFieldContainer[float]
     sampler: SamplerOptions
     refined: bool
-    def __init__(self, name: _Optional[str] = ..., digest: _Optional[str] = ..., is_default: bool = ..., state_dim: _Optional[int] = ..., action_dim: _Optional[int] = ..., plan_horizon: _Optional[int] = ..., block_len: _Optional[int] = ..., obs_horizon: _Optional[int] = ..., latent_dim: _Optional[int] = ..., level_max: _Optional[int] = ..., action_low: _Optional[_Iterable[float]] = ..., action_high: _Optional[_Iterable[float]] = ..., sampler: _Optional[_Union[SamplerOptions, _Mapping]] = ..., refined: bool = ...) -> None: ...
+    trained: Trained
+    def __init__(self, name: _Optional[str] = ..., digest: _Optional[str] = ..., is_default: bool = ..., state_dim: _Optional[int] = ..., action_dim: _Optional[int] = ..., plan_horizon: _Optional[int] = ..., block_len: _Optional[int] = ..., obs_horizon: _Optional[int] = ..., latent_dim: _Optional[int] = ..., level_max: _Optional[int] = ..., action_low: _Optional[_Iterable[float]] = ..., action_high: _Optional[_Iterable[float]] = ..., sampler: _Optional[_Union[SamplerOptions, _Mapping]] = ..., refined: bool = ..., trained: _Optional[_Union[Trained, _Mapping]] = ...) -> None: ...
+
+class Trained(_message.Message):
+    __slots__ = ("action_horizons", "sub_steps", "missing")
+    ACTION_HORIZONS_FIELD_NUMBER: _ClassVar[int]
+    SUB_STEPS_FIELD_NUMBER: _ClassVar[int]
+    MISSING_FIELD_NUMBER: _ClassVar[int]
+    action_horizons: _containers.RepeatedScalarFieldContainer[int]
+    sub_steps: _containers.RepeatedScalarFieldContainer[int]
+    missing: Missing
+    def __init__(self, action_horizons: _Optional[_Iterable[int]] = ..., sub_steps: _Optional[_Iterable[int]] = ..., missing: _Optional[_Union[Missing, _Mapping]] = ...) -> None: ...
+
+class Missing(_message.Message):
+    __slots__ = ("state", "action", "reward")
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    REWARD_FIELD_NUMBER: _ClassVar[int]
+    state: bool
+    action: bool
+    reward: bool
+    def __init__(self, state: bool = ..., action: bool = ..., reward: bool = ...) -> None: ...
 
 class SamplerOptions(_message.Message):
     __slots__ = ("streaming", "action_horizon", "sub_steps", "eta", "temperature", "kappa", "latent")

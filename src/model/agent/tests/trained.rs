@@ -58,7 +58,7 @@ fn a_chunk_length_that_was_not_trained_is_refused() {
     let open = |action_horizon| agent.open(1, &SamplerOptions { action_horizon, ..options() });
     assert!(open(1).is_ok() && open(4).is_ok());
     let error = open(2).unwrap_err().to_string();
-    assert_eq!(error, "options.action_horizon: this checkpoint was trained for chunks of {1, 4} actions, not 2");
+    assert_eq!(error, "options.action_horizon: this checkpoint was trained for chunks of [1, 4] actions, not 2");
 }
 
 /// The planned states began with the state in which the chunk's last action was executed, one step before what they are said to be.
