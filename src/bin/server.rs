@@ -9,7 +9,11 @@ use ada_diffuser::{
     },
 };
 use clap::Parser;
-use std::{path::PathBuf, process::ExitCode};
+use std::{
+    io::{self, Write},
+    path::PathBuf,
+    process::ExitCode,
+};
 use tokio::signal::unix::{SignalKind, signal};
 
 /// Serves Ada-Diffuser models over gRPC and REST on one port.
@@ -55,8 +59,8 @@ fn main() -> ExitCode {
     match run(Flags::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            // Each cause once, and no backtrace, which is how `main` itself would tell it.
-            eprintln!("error: {error:#}");
+            // Each cause once, and no backtrace, which is how `main` itself would tell it; and no panic where stderr is gone.
+            let _unwritten = writeln!(io::stderr(), "error: {error:#}");
             ExitCode::FAILURE
         }
     }
@@ -64,10 +68,16 @@ fn main() -> ExitCode {
 
 fn run(flags: Flags) -> anyhow::Result<()> {
     if let Err(error) = restart::with_environment(&restart::ONE_THREAD_EACH) {
-        eprintln!("warning: could not start anew with one thread for each product ({error}); serving will be slower");
+        let _unwritten = writeln!(io::stderr(), "warning: could not start anew with one thread for each product ({error}); serving will be slower");
     }
     let config = flags.config()?;
-    telemetry::install_log(&config.telemetry);
+    let log = telemetry::install_log(&config.telemetry, io::stderr())?;
+    let served = serve(config);
+    log.end();
+    served
+}
+
+fn serve(config: Config) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(config.server.io_threads).enable_all().build()?;
     let served = runtime.block_on(async {
         let shutdown = shutdown()?;

@@ -26,6 +26,7 @@ use tokio::{
     time::{interval, sleep},
 };
 use tokio_util::sync::CancellationToken;
+use tonic_health::server::HealthReporter;
 
 /// What the engine's threads get to end after the last connection is gone.
 const ENGINE_PATIENCE: Duration = Duration::from_secs(2);
@@ -44,6 +45,9 @@ pub enum ServerError {
     /// No threads for the engine.
     #[error("engine: {0}")]
     Engine(io::Error),
+    /// The accept loop is gone.
+    #[error("the accept loop ended: a defect of the server; see the log")]
+    Accept,
     /// No model to serve.
     #[error(transparent)]
     Models(#[from] RegistryError),
@@ -90,12 +94,12 @@ impl Server {
         grpc::report(&health, false).await;
         let faces = Faces { grpc, http: http::router(http::State { service: service.clone(), metrics: metrics.clone() }) };
         let leave = CancellationToken::new();
-        let listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), leave.clone()));
+        let mut listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), leave.clone()));
         let serving = async {
             load(&service, config.clone()).await?;
             grpc::report(&health, true).await;
             tracing::info!(address = %config.server.listen, "ready");
-            housekeeping(&service, || metrics.run_upkeep()).await;
+            housekeeping(&service, &health, || metrics.run_upkeep()).await;
             Ok(())
         };
         let served = tokio::select! {
@@ -104,12 +108,14 @@ impl Server {
                 Ok(())
             }
             served = serving => served,
+            // Without it the process would live on and take no more connections.
+            _ended = &mut listening => Err(ServerError::Accept),
         };
         grpc::report(&health, false).await;
         service.drain();
         sleep(Duration::from_millis(config.server.drain_notice_ms)).await;
         leave.cancel();
-        if listening.await.is_err() {
+        if !matches!(served, Err(ServerError::Accept)) && listening.await.is_err() {
             tracing::error!("the accept loop ended by panic");
         }
         let stopping = tokio::task::spawn_blocking(move || service.stop(ENGINE_PATIENCE));
@@ -136,11 +142,18 @@ async fn load(service: &Arc<Service>, config: Config) -> Result<(), ServerError>
     Ok(())
 }
 
-async fn housekeeping(service: &Service, upkeep: impl Fn()) {
+async fn housekeeping(service: &Service, health: &HealthReporter, upkeep: impl Fn()) {
     let mut ticks = interval(Duration::from_millis(service.config().sessions.reap_interval_ms));
+    let mut was_ready = true;
     loop {
         ticks.tick().await;
         service.reap();
         upkeep();
+        let is_ready = service.ready().is_ok();
+        if is_ready != was_ready {
+            tracing::warn!(is_ready, "readiness changed");
+            grpc::report(health, is_ready).await;
+            was_ready = is_ready;
+        }
     }
 }

@@ -31,22 +31,35 @@ impl Ticket for Seat {
     }
 
     fn settle(self, outcome: Result<Finished, Failure>) {
-        let Self { session, flight } = self;
+        let Self { session, flight } = &self;
         match outcome {
             Ok(Finished { episode, chunk, queue, compute, at }) => {
                 let now = Instant::now();
                 let timings = Timings { queue, compute, commit: now - at, total: now - flight.arrived };
                 let (model, model_digest) = (session.model.clone(), session.agent.spec().digest.clone());
                 let answer = Answer { session: session.id, step: flight.step, chunk, timings, model, model_digest };
-                session.commit(&flight, episode, answer);
+                session.commit(flight, episode, answer);
             }
-            Err(Failure::Agent(error)) => session.fail(&flight, ServiceError::from_agent(error)),
-            Err(Failure::Panic) => {
-                let id = Uuid::new_v4();
-                tracing::error!(%id, model = %session.model, step = flight.step, "the model panicked over an act");
-                session.fail(&flight, ServiceError::EnginePanic { id });
-            }
-            Err(Failure::Stopped) => session.fail(&flight, ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS }),
+            Err(Failure::Agent(error)) => session.fail(flight, ServiceError::from_agent(error)),
+            Err(Failure::Panic) => self.panicked("the model panicked over an act"),
+            Err(Failure::Stopped) => session.fail(flight, ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS }),
+        }
+    }
+}
+
+impl Seat {
+    fn panicked(&self, what: &str) {
+        let id = Uuid::new_v4();
+        tracing::error!(%id, model = %self.session.model, step = self.flight.step, "{what}");
+        self.session.fail(&self.flight, ServiceError::EnginePanic { id });
+    }
+}
+
+/// An act that was given up half done tells so to whoever waits for it; one that is settled has told already.
+impl Drop for Seat {
+    fn drop(&mut self) {
+        if self.flight.is_wanted() {
+            self.panicked("an act was given up, for a defect of the server");
         }
     }
 }

@@ -10,6 +10,7 @@ use crate::{
         request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
         session::{Answer, Entry, Opening, Session, Sessions, Summary, Waiter, key_of},
+        telemetry,
     },
 };
 use futures_util::{Stream, StreamExt, future::join_all};
@@ -91,12 +92,21 @@ impl Service {
         self.engine.heartbeat_age() <= Duration::from_millis(self.config.engine.heartbeat_age_ms_max)
     }
 
-    /// Whether it takes new sessions.
+    /// Whether it takes new work.
+    ///
+    /// # Errors
+    /// `NotReady`, `Draining`.
+    pub fn accepts(&self) -> Result<(), ServiceError> {
+        self.registry().map(|_| ())
+    }
+
+    /// Whether it takes new work and gets it done: models loaded, not draining, every worker alive.
     ///
     /// # Errors
     /// Why not.
-    pub fn ready(&self) -> Result<(), ServiceError> {
-        self.registry().map(|_| ())
+    pub fn ready(&self) -> Result<(), String> {
+        self.accepts().map_err(|error| error.to_string())?;
+        if self.is_alive() { Ok(()) } else { Err("a worker of the engine is silent".to_owned()) }
     }
 
     /// House-keeping, to be called every `sessions.reap_interval_ms`.
@@ -107,6 +117,7 @@ impl Service {
     /// Brings the gauges up to date before they are read.
     pub fn refresh_gauges(&self) {
         let (waiting, running) = self.engine.load();
+        telemetry::count_left_out();
         metrics::gauge!("ada_queue_depth").set(waiting as f64);
         metrics::gauge!("ada_inflight_acts").set(running as f64);
         metrics::gauge!("ada_sessions").set(self.sessions.len() as f64);

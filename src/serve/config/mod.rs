@@ -152,6 +152,8 @@ pub struct TelemetryConfig {
     pub log: String,
     /// Lines for people or for machines.
     pub format: LogFormat,
+    /// Lines a second of each message (each place that logs one); more are counted and left out, except those below `info`. 0: no bound.
+    pub log_repeats_max: u64,
 }
 
 /// How a log line looks.
@@ -236,7 +238,7 @@ impl Default for ModelsConfig {
 
 impl Default for TelemetryConfig {
     fn default() -> Self {
-        Self { log: "info".to_owned(), format: LogFormat::Pretty }
+        Self { log: "info".to_owned(), format: LogFormat::Pretty, log_repeats_max: 20 }
     }
 }
 

@@ -25,7 +25,7 @@ use std::{
 
 pub use queue::Refusal;
 
-/// The other end of a submitted act.
+/// The other end of a submitted act. One that is dropped before it is settled was given up; it should tell whoever waits.
 pub trait Ticket: Send + 'static {
     /// Whether somebody still waits for it; asked between network evaluations.
     fn is_wanted(&self) -> bool;

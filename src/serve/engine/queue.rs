@@ -24,7 +24,6 @@ pub(super) struct Queue<J> {
     inner: Mutex<Inner<J>>,
     ready: Condvar,
     len_max: usize,
-    workers: usize,
 }
 
 /// A job that waits. A deadline is a point in time, so whoever waits comes to be the first of all: nobody starves.
@@ -38,15 +37,15 @@ struct Waiting<J> {
 struct Inner<J> {
     jobs: BinaryHeap<Reverse<Waiting<J>>>,
     arrivals: u64,
-    /// Jobs in the batches of all workers.
-    running: usize,
+    /// Jobs in the batch of each worker.
+    running: Vec<usize>,
     closed: bool,
 }
 
 impl<J> Queue<J> {
     pub fn new(len_max: usize, workers: usize) -> Self {
-        let inner = Inner { jobs: BinaryHeap::new(), arrivals: 0, running: 0, closed: false };
-        Self { inner: Mutex::new(inner), ready: Condvar::new(), len_max, workers }
+        let inner = Inner { jobs: BinaryHeap::new(), arrivals: 0, running: vec![0; workers], closed: false };
+        Self { inner: Mutex::new(inner), ready: Condvar::new(), len_max }
     }
 
     /// Adds a job; before it is refused for want of room, jobs that nobody wants any more make room.
@@ -68,10 +67,10 @@ impl<J> Queue<J> {
         Ok(())
     }
 
-    /// Jobs for a worker that holds `held` jobs, has ended `ended` since it last asked, and has `room` for more; None: the end. Waits only if it holds none.
-    pub fn take(&self, held: usize, ended: usize, room: usize) -> Option<Vec<J>> {
+    /// Jobs for a worker that holds `held` jobs now and has `room` for more; None: the end. Waits only if it holds none.
+    pub fn take(&self, worker: usize, held: usize, room: usize) -> Option<Vec<J>> {
         let mut inner = self.inner.lock();
-        inner.running -= ended;
+        inner.running[worker] = held;
         if inner.jobs.is_empty() && held == 0 && !inner.closed {
             self.ready.wait_for(&mut inner, IDLE_WAIT);
         }
@@ -79,9 +78,9 @@ impl<J> Queue<J> {
             return None;
         }
         // An even share: with two workers and four acts, two batches of two end sooner than one of four.
-        let share = (inner.running + inner.jobs.len()).div_ceil(self.workers);
+        let share = (inner.running.iter().sum::<usize>() + inner.jobs.len()).div_ceil(inner.running.len());
         let count = share.saturating_sub(held).min(room).min(inner.jobs.len());
-        inner.running += count;
+        inner.running[worker] += count;
         if inner.jobs.len() > count {
             self.ready.notify_one();
         }
@@ -102,7 +101,7 @@ impl<J> Queue<J> {
     /// Jobs that wait, and jobs in batches.
     pub fn load(&self) -> (usize, usize) {
         let inner = self.inner.lock();
-        (inner.jobs.len(), inner.running)
+        (inner.jobs.len(), inner.running.iter().sum())
     }
 
     /// Ends the queue and gives back what waits in it.
@@ -147,11 +146,11 @@ mod tests {
         assert_eq!(queue.push(4, now, wanted), Err((Refusal::Full, 4)));
         assert_eq!(queue.take(0, 0, 8), Some(vec![2, 3]));
         assert_eq!(queue.load(), (0, 2));
-        assert_eq!(queue.take(1, 1, 8), Some(vec![]), "does not wait while it holds one");
+        assert_eq!(queue.take(0, 1, 8), Some(vec![]), "does not wait while it holds one");
         assert_eq!(queue.load(), (0, 1));
         assert_eq!(queue.close(), Vec::<i32>::new());
         assert_eq!(queue.push(5, now, wanted), Err((Refusal::Closed, 5)));
-        assert_eq!(queue.take(0, 1, 8), None);
+        assert_eq!(queue.take(0, 0, 8), None);
     }
 
     #[test]
@@ -161,11 +160,14 @@ mod tests {
             queue.push(job, now, |_| true).unwrap();
         }
         assert_eq!(queue.take(0, 0, 8).unwrap().len(), 3);
-        assert_eq!(queue.take(0, 0, 8).unwrap().len(), 2);
+        assert_eq!(queue.take(1, 0, 8).unwrap().len(), 2);
         for job in 0..9 {
             queue.push(job, now, |_| true).unwrap();
         }
-        assert_eq!(queue.take(2, 0, 1).unwrap().len(), 1, "no more than there is room");
+        assert_eq!(queue.take(0, 2, 1).unwrap().len(), 1, "no more than there is room");
+        assert_eq!(queue.load(), (8, 5));
+        queue.take(0, 0, 0);
+        assert_eq!(queue.load(), (8, 2), "a worker that holds nothing any more, for whatever reason, runs nothing");
     }
 
     /// The earliest deadline first; and with a stream of acts that are always more urgent when they come, an old one still gets its turn
@@ -178,13 +180,13 @@ mod tests {
             queue.push(job, at(ms), |_| true).unwrap();
         }
         assert_eq!(queue.take(0, 0, 3), Some(vec![2, 4, 3]));
-        assert_eq!(queue.take(0, 3, 3), Some(vec![1]));
+        assert_eq!(queue.take(0, 0, 3), Some(vec![1]));
         queue.push(0, at(100), |_| true).unwrap();
         let mut turns = 0;
         for arrival in 1.. {
             queue.push(arrival, at(arrival as u64 * 10 + 5), |_| true).unwrap();
             turns += 1;
-            if queue.take(0, 1, 1).unwrap() == [0] {
+            if queue.take(0, 0, 1).unwrap() == [0] {
                 break;
             }
         }

@@ -86,6 +86,16 @@ impl<T: Ticket> Batch<T> {
         self.groups.retain(|group| !group.riders.is_empty());
     }
 
+    /// Drops all acts, half done as they are; their tickets know what to do. What was measured stays.
+    pub fn abandon(&mut self) {
+        for group in self.groups.drain(..) {
+            for rider in group.riders {
+                // The one that panicked may do so again when it is dropped.
+                drop(catch_unwind(AssertUnwindSafe(|| drop(rider))));
+            }
+        }
+    }
+
     /// The end: whoever is left fails.
     pub fn stop(self) {
         let riders = self.groups.into_iter().flat_map(|group| group.riders);

@@ -121,7 +121,7 @@ impl agent_server::Agent for Face {
     }
 
     async fn act_stream(&self, request: Request<Streaming<pb::ActRequest>>) -> Answer<Self::ActStreamStream> {
-        self.0.ready().map_err(refuse)?;
+        self.0.accepts().map_err(refuse)?;
         let timeout = timeout(request.metadata());
         let limit = self.0.config().limits.message_bytes_max;
         let acts = request.into_inner().map(move |act| match act {

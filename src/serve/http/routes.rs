@@ -182,7 +182,7 @@ async fn act_stream(
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
     let upgrade = upgrade.map_err(|error| ServiceError::invalid("headers", error.body_text()))?;
-    state.service.ready()?;
+    state.service.accepts()?;
     state.service.get(&id)?;
     let limit = state.service.config().limits.message_bytes_max;
     let upgrade = upgrade.max_message_size(limit).max_frame_size(limit);

@@ -24,6 +24,7 @@ struct Seat {
     outcome: mpsc::Sender<Outcome>,
     gate: Option<mpsc::Receiver<()>>,
     due: Option<Instant>,
+    panics: bool,
 }
 
 impl Ticket for Seat {
@@ -32,6 +33,7 @@ impl Ticket for Seat {
     }
 
     fn start(&self) {
+        assert!(!self.panics, "as a log line once did, when nobody read the log");
         if let Some(gate) = &self.gate {
             gate.recv().unwrap();
         }
@@ -71,7 +73,7 @@ fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Recei
     let question = Question { episode, observation };
     let descent = question.begin(asked).unwrap();
     let (outcome, receiver) = mpsc::channel();
-    let ticket = Seat { outcome, gate: None, due: None };
+    let ticket = Seat { outcome, gate: None, due: None, panics: false };
     let now = Instant::now();
     (Job { agent: run_on.clone(), question, descent, ticket, submitted: now, turn_by: now }, receiver)
 }
@@ -105,6 +107,29 @@ fn a_poisoned_act_fails_alone() {
     let failed = poisoned.recv_timeout(Duration::from_secs(20)).unwrap();
     assert!(matches!(failed, Err(Failure::Panic | Failure::Agent(_))), "{failed:?}");
     assert!(engine.heartbeat_age() < Duration::from_secs(2), "the worker lives");
+}
+
+/// Whatever panics outside of the model took the thread with it, and after as many acts as there are threads the engine was gone for good,
+/// with every probe green. It costs the acts of that batch, and they are told.
+#[test]
+fn a_panic_outside_of_the_model_costs_its_batch_alone() {
+    let tiny = agent("tiny");
+    let engine = one_worker(8);
+    engine.warm_up(&tiny).unwrap();
+    for seed in 0..3 {
+        let (mut bad, given_up) = job(&tiny, &tiny, seed);
+        bad.ticket.panics = true;
+        assert!(engine.submit(bad).is_ok());
+        assert!(given_up.recv_timeout(Duration::from_secs(20)).is_err(), "its ticket was dropped");
+        let (good, outcome) = job(&tiny, &tiny, seed);
+        let expected = tiny.act(&good.question.episode, &good.question.observation).unwrap().1;
+        assert!(engine.submit(good).is_ok());
+        assert_eq!(outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap().chunk, expected);
+    }
+    while engine.load() != (0, 0) {
+        std::thread::yield_now();
+    }
+    assert!(engine.heartbeat_age() < Duration::from_secs(2));
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! A real server on a free port, and a client for each face.
 
 mod bytes;
+mod ends;
 mod engine;
 mod errors;
 mod generator;
@@ -37,6 +38,8 @@ use tonic::{Code, Status, transport::Channel};
 
 /// A state that every test model takes.
 pub const STATE: [f32; 4] = [0.1, -0.2, 0.3, 0.4];
+/// A state, rare but possible, for which the output of the model `exploding` is not finite.
+pub const EXPLODING_STATE: [f32; 4] = [1e5, -1e5, 1e5, 1e5];
 /// Steps per rung with which the model `slow` takes minutes for an act.
 const SLOW_SUB_STEPS: usize = 25_000;
 
@@ -145,23 +148,29 @@ impl Drop for Process {
 
 /// `ada-server` as a user starts it, on a free port, ready. Its metrics are its own, while servers of one process share theirs.
 pub async fn start_process(settings: &[&str]) -> (Process, Running) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ada-server"));
-    command.args(["--listen", "127.0.0.1:0", "--default-model", "tiny", "--set", "telemetry.format=json", "--models"]).arg(models_dir());
-    command.args(settings.iter().flat_map(|setting| ["--set", setting]));
-    command.env("ADA__ENGINE__BATCH_LEN_MAX", "1").env_remove("RAYON_NUM_THREADS").env_remove("CANDLE_NUM_THREADS");
+    let mut command = binary(settings);
+    command.args(["--listen", "127.0.0.1:0"]);
     let mut process = Process(command.stderr(Stdio::piped()).spawn().unwrap());
     let mut lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
     let line = lines.by_ref().map(Result::unwrap).find(|line| line.contains("\"listening\"")).expect("it ended before it listened");
     std::thread::spawn(move || lines.for_each(drop));
     let event: Value = serde_json::from_str(&line).unwrap();
-    let address = event["address"].as_str().unwrap().parse().unwrap();
-    let running = Running { address, stop: CancellationToken::new(), done: tokio::spawn(async { Ok(()) }) };
+    let running = Running::elsewhere(event["address"].as_str().unwrap().parse().unwrap());
     running.ready().await;
     (process, running)
 }
 
+/// `ada-server` over the test models, with warm-up of one batch length alone.
+fn binary(settings: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ada-server"));
+    command.args(["--default-model", "tiny", "--set", "telemetry.format=json", "--models"]).arg(models_dir());
+    command.args(settings.iter().flat_map(|setting| ["--set", setting]));
+    command.env("ADA__ENGINE__BATCH_LEN_MAX", "1").env_remove("RAYON_NUM_THREADS").env_remove("CANDLE_NUM_THREADS");
+    command
+}
+
 /// An HTTP answer.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Reply {
     pub status: u16,
     pub headers: hyper::HeaderMap,
@@ -181,6 +190,11 @@ impl Reply {
 }
 
 impl Running {
+    /// A server of another process.
+    fn elsewhere(address: SocketAddr) -> Self {
+        Self { address, stop: CancellationToken::new(), done: tokio::spawn(async { Ok(()) }) }
+    }
+
     async fn ready(&self) {
         for _ in 0..500 {
             if self.get("/readyz").await.status == 200 {

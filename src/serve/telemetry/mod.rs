@@ -1,10 +1,18 @@
 //! Logs and metrics. Every metric is described in [`CATALOGUE`], in base units; no label ever holds a session id.
 
+mod lines;
+
 use crate::serve::config::{LogFormat, TelemetryConfig};
+use lines::{LeftOut, Lines, Repeats};
 use metrics::Unit;
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
-use std::sync::{Mutex, PoisonError};
-use tracing_subscriber::EnvFilter;
+use std::{
+    io::{self, Write},
+    panic,
+    sync::{Arc, LazyLock, Mutex, PoisonError},
+    time::Duration,
+};
+use tracing_subscriber::{EnvFilter, Layer, filter::FilterExt, layer::SubscriberExt, util::SubscriberInitExt};
 
 /// Seconds; fine enough for acts of a millisecond.
 const LATENCY_BUCKETS: [f64; 24] = [
@@ -28,7 +36,7 @@ pub enum Kind {
 use Kind::{Counter, Gauge, Histogram};
 
 /// Every metric: name, kind, meaning.
-pub const CATALOGUE: [(&str, Kind, &str); 32] = [
+pub const CATALOGUE: [(&str, Kind, &str); 33] = [
     ("ada_build_info", Gauge, "1, labelled by version"),
     ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
     ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
@@ -60,17 +68,52 @@ pub const CATALOGUE: [(&str, Kind, &str); 32] = [
     ("ada_sessions_created_total", Counter, "sessions opened"),
     ("ada_sessions_ended_total", Counter, "sessions ended, by reason: closed, expired, evicted"),
     ("ada_engine_panics_total", Counter, "panics caught in the engine"),
+    ("ada_log_lines_left_out_total", Counter, "log lines that could not be written, or repeated a message too often, by reason"),
     ("ada_nonfinite_total", Counter, "non-finite network outputs, by place"),
 ];
 
-/// Starts logging as configured. A second call in one process is ignored: the first one's choice stands.
-pub fn install_log(config: &TelemetryConfig) {
-    let filter = EnvFilter::try_new(&config.log).unwrap_or_else(|_| EnvFilter::new("info"));
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    let _second_call = match config.format {
-        LogFormat::Pretty => builder.try_init(),
-        LogFormat::Json => builder.json().flatten_event(true).try_init(),
+static LEFT_OUT: LazyLock<Arc<LeftOut>> = LazyLock::new(Arc::default);
+
+/// The log of the process; [`Log::end`] it, or the last lines may be lost.
+pub struct Log(Option<Lines>);
+
+impl Log {
+    /// Waits for a moment until everything is written. A log that cannot be written does not keep the process.
+    pub fn end(self) {
+        const PATIENCE: Duration = Duration::from_secs(1);
+        self.0.map(|lines| lines.flush(PATIENCE));
+    }
+}
+
+/// Starts logging to `out` as configured, panics included: the stock hook writes to stderr itself, and waits where nobody reads. A second call in
+/// one process is ignored: the first one's choice stands.
+///
+/// # Errors
+/// If the system gives no thread.
+pub fn install_log(config: &TelemetryConfig, out: impl Write + Send + 'static) -> io::Result<Log> {
+    let lines = Lines::start(out, LEFT_OUT.clone())?;
+    let level = EnvFilter::try_new(&config.log).unwrap_or_else(|_| EnvFilter::new("info"));
+    let filter = level.and(Repeats::new(config.log_repeats_max, LEFT_OUT.clone()));
+    let layer = tracing_subscriber::fmt::layer().with_writer(lines.clone()).log_internal_errors(false);
+    let installed = match config.format {
+        LogFormat::Pretty => tracing_subscriber::registry().with(layer.with_filter(filter)).try_init(),
+        LogFormat::Json => tracing_subscriber::registry().with(layer.json().flatten_event(true).with_filter(filter)).try_init(),
     };
+    if installed.is_err() {
+        return Ok(Log(None));
+    }
+    panic::set_hook(Box::new(|panic| {
+        let place = panic.location().map(ToString::to_string).unwrap_or_default();
+        tracing::error!(place, thread = std::thread::current().name().unwrap_or_default(), "panic: {}", panic.payload_as_str().unwrap_or("?"));
+    }));
+    Ok(Log(Some(lines)))
+}
+
+/// Brings the counter of lines that are missing from the log up to date.
+pub fn count_left_out() {
+    for (reason, count) in ["unwritten", "repeated"].into_iter().zip(LEFT_OUT.counts()) {
+        metrics::counter!("ada_log_lines_left_out_total", "reason" => reason).absolute(count);
+    }
 }
 
 /// Starts collecting metrics, once a process, and gives the handle that renders them.
