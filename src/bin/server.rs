@@ -68,7 +68,8 @@ fn main() -> ExitCode {
 
 fn run(flags: Flags) -> anyhow::Result<()> {
     if let Err(error) = restart::with_environment(&restart::ONE_THREAD_EACH) {
-        let _unwritten = writeln!(io::stderr(), "warning: could not start anew with one thread for each product ({error}); serving will be slower");
+        let _unwritten =
+            writeln!(io::stderr(), "warning: could not start anew with one thread for each product ({error}); serving will be slower");
     }
     let config = flags.config()?;
     let log = telemetry::install_log(&config.telemetry, io::stderr())?;

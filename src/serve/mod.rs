@@ -136,7 +136,7 @@ async fn listen(address: &str) -> io::Result<TcpListener> {
 
 async fn load(service: &Arc<Service>, config: Config) -> Result<(), ServerError> {
     let warm = service.clone();
-    let loading = move || Registry::load(&config.models).inspect(|registry| warm.warm_up(registry));
+    let loading = move || Registry::load(&config.models).and_then(|registry| warm.warm_up(registry));
     let loaded = tokio::task::spawn_blocking(loading).await;
     service.set_registry(loaded.map_err(|panic| ServerError::Engine(io::Error::other(panic)))??);
     Ok(())

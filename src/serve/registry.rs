@@ -71,10 +71,23 @@ impl Registry {
         if models.is_empty() {
             return Err(RegistryError::Empty { dir: config.dir.clone() });
         }
-        let Some(default) = models.values().find(|model| model.is_default).map(|model| model.name.clone()) else {
-            return Err(RegistryError::NoDefault { name: config.default.clone(), loaded: names(&models) });
-        };
-        Ok(Self { models, default })
+        Self { models, default: Arc::from(&*config.default) }.with_default()
+    }
+
+    /// Without the models that do not `work`, which are refused with the reason.
+    ///
+    /// # Errors
+    /// If the default is one of them.
+    pub fn keep(mut self, works: impl Fn(&Model) -> Result<(), String>) -> Result<Self, RegistryError> {
+        self.models.retain(|name, model| works(model).inspect_err(|error| refuse(name, "warm-up", error)).is_ok());
+        self.with_default()
+    }
+
+    fn with_default(self) -> Result<Self, RegistryError> {
+        if self.models.contains_key(&self.default) {
+            return Ok(self);
+        }
+        Err(RegistryError::NoDefault { name: self.default.to_string(), loaded: names(&self.models) })
     }
 
     /// All models by name.

@@ -4,9 +4,9 @@ use crate::{
     model::agent::Episode,
     serve::{
         config::{Config, EngineConfig},
-        engine::{Engine, EngineOptions, Job, Question, Refusal},
+        engine::{Engine, EngineOptions, Failure, Job, Question, Refusal},
         error::{ServiceError, Stage},
-        registry::{Model, Registry},
+        registry::{Model, Registry, RegistryError},
         request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
         session::{Answer, Entry, Opening, Session, Sessions, Summary, Waiter, key_of},
@@ -42,22 +42,29 @@ impl Service {
     /// # Errors
     /// If the system gives no threads for the engine.
     pub fn start(config: Config) -> std::io::Result<Self> {
-        let EngineConfig { workers, queue_len_max, batch_len_max, deadline_margin_ms, .. } = config.engine;
+        let EngineConfig { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin_ms, .. } = config.engine;
         let deadline_margin = Duration::from_millis(deadline_margin_ms);
-        let engine = Engine::start(EngineOptions { workers, queue_len_max, batch_len_max, deadline_margin })?;
+        let engine = Engine::start(EngineOptions { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin })?;
         let sessions = Sessions::new(config.sessions.clone());
         Ok(Self { config, registry: OnceLock::new(), sessions, engine, draining: CancellationToken::new() })
     }
 
-    /// Runs each model in every batch length, so that its first act is as fast as any. Blocks for that time.
-    pub fn warm_up(&self, registry: &Registry) {
-        for model in registry.list() {
+    /// Runs each model in every batch length, so that its first act is as fast as any. Blocks for that time. Gives the models back that can
+    /// act; a panic, or an output that is not finite, costs the model its place, and the others nothing.
+    ///
+    /// # Errors
+    /// If the default model is not among them.
+    pub fn warm_up(&self, registry: Registry) -> Result<Registry, RegistryError> {
+        registry.keep(|model| {
             let begin = Instant::now();
             match self.engine.warm_up(&model.agent) {
                 Ok(()) => tracing::info!(model = %model.name, ms = begin.elapsed().as_millis() as u64, "warmed up"),
-                Err(failure) => tracing::error!(model = %model.name, ?failure, "warm-up failed; its acts will say why"),
+                Err(Failure::Stopped) => {}
+                Err(Failure::Agent(error)) => return Err(error.to_string()),
+                Err(Failure::Panic) => return Err("it panics".to_owned()),
             }
-        }
+            Ok(())
+        })
     }
 
     /// Gives it its models, once; from then on it is ready.
@@ -257,6 +264,10 @@ impl Service {
     async fn act_on(&self, session: &Arc<Session>, request: ActRequest, arrived: Instant) -> Result<Acted, ServiceError> {
         let ActRequest { step, observation, deadline, timeout, want_planned_states, .. } = request;
         let limits = &self.config.limits;
+        if observation.executed.len() > limits.executed_len_max {
+            metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
+            return Err(ServiceError::TooLarge { what: "number of executed steps", limit: limits.executed_len_max });
+        }
         let longest = Duration::from_millis(limits.act_deadline_ms_max);
         let usual = Duration::from_millis(limits.act_deadline_ms);
         let patience = deadline.unwrap_or(usual).min(longest);
@@ -293,7 +304,11 @@ impl Service {
             Err(error) => return seat.session.fail(&seat.flight, ServiceError::from_agent(error)),
         };
         let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now(), turn_by };
-        let Err((refusal, job)) = self.engine.submit(job) else { return };
+        let flight = job.ticket.flight.clone();
+        let (refusal, job) = match self.engine.submit(job) {
+            Ok(waiting) => return flight.waits(|| waiting.leave()),
+            Err(refused) => refused,
+        };
         let error = match refusal {
             Refusal::Full => {
                 metrics::counter!("ada_shed_total", "reason" => "QUEUE_FULL").increment(1);

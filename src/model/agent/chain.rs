@@ -19,6 +19,10 @@ impl Chain {
         Self { mean: vec![0.0; len * dim], log_var: vec![0.0; len * dim], dim, first: 0 }
     }
 
+    pub(super) fn size_bytes(&self) -> usize {
+        (self.mean.capacity() + self.log_var.capacity()) * size_of::<f32>()
+    }
+
     /// How many belong to position 0 and those behind it.
     pub(super) fn len(&self) -> usize {
         self.mean.len().checked_div(self.dim).map_or(0, |len| len - self.first)

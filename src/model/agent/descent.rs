@@ -91,6 +91,14 @@ impl Descent {
         self.evaluations
     }
 
+    /// Resident size in bytes, beside its own: the copy of the episode, and the working memory.
+    pub fn size_bytes(&self) -> usize {
+        let floats = [&self.state, &self.x, &self.x0, &self.anchor, &self.emitted, &self.predicted_state, &self.eps];
+        self.episode.size_bytes()
+            + self.chain.size_bytes()
+            + floats.iter().map(|values| values.capacity() * size_of::<f32>()).sum::<usize>()
+    }
+
     pub(super) fn has_started(&self) -> bool {
         self.started
     }
@@ -185,7 +193,7 @@ impl Descent {
             let (keep, add) = walk.process.renoise(self.ladder.level(from), self.ladder.level(to));
             // The act's own offset joins the level: a position may be noised to the same level again at a later act.
             let (noise, time) = (self.noise(), self.time() + position as u64);
-            noise.fill(time, (to | position << 16) as u32, Slot::Renoise, &mut self.eps);
+            noise.fill(time, noise_key(to, position), Slot::Renoise, &mut self.eps);
             let add = add * temperature;
             self.x[position * dim..][..dim].iter_mut().zip(&self.eps).for_each(|(x, eps)| *x = keep * *x + add * eps);
         }
@@ -303,7 +311,7 @@ impl Descent {
         if jump.noise > 0.0 {
             // The position joins the level, as in `renoise`: a later act may walk the same levels again.
             let (noise, time) = (self.noise(), self.time() + position as u64);
-            noise.fill(time, (levels[1] | position << 16) as u32, Slot::Jump, &mut self.eps);
+            noise.fill(time, noise_key(levels[1], position), Slot::Jump, &mut self.eps);
         } else {
             self.eps.fill(0.0);
         }
@@ -365,10 +373,31 @@ impl Descent {
     }
 }
 
+/// Noise key of a fine level (20 bits) at a position (10 bits), a number of its own for each pair; the bounds are those of
+/// [`ModelConfig::check`].
+fn noise_key(level: usize, position: usize) -> u32 {
+    (level & 0xFFFF | position << 16 | (level >> 16) << 26) as u32
+}
+
 fn norm(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt()
 }
 
 fn rms(a: &[f32], b: &[f32]) -> f32 {
     norm(a, b) / (a.len().max(1) as f32).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::noise_key;
+    use std::collections::HashSet;
+
+    /// Levels from 65,536 on shared their noise with the next position.
+    #[test]
+    fn each_level_of_each_position_has_its_own_noise() {
+        let levels = (0..1 << 20).step_by(4093).chain([65_535, 65_536, 65_537, 1 << 20]);
+        let keys: HashSet<u32> = levels.clone().flat_map(|level| (0..1024).map(move |position| noise_key(level, position))).collect();
+        assert_eq!(keys.len(), levels.collect::<HashSet<_>>().len() * 1024);
+        assert_eq!(noise_key(7, 3), 7 | 3 << 16, "as it always was");
+    }
 }

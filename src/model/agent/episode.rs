@@ -1,6 +1,6 @@
 //! What one episode remembers between acts.
 
-use super::{Agent, AgentError, Executed, Observation, SamplerOptions, finite};
+use super::{Agent, AgentError, Executed, Observation, SamplerOptions, finite, known};
 use crate::model::trajectory::Token;
 use std::collections::VecDeque;
 
@@ -55,12 +55,13 @@ impl Episode {
         fresh
     }
 
-    /// Appends executed tokens; keeps the last `keep`.
+    /// Appends executed tokens; keeps the last `keep`, and memory for no more.
     pub(super) fn commit(&mut self, executed: Vec<Token>, keep: usize) {
         self.time += executed.len() as u64;
-        self.history.extend(executed);
-        let surplus = self.history.len().saturating_sub(keep);
-        self.history.drain(..surplus);
+        let surplus = (self.history.len() + executed.len()).saturating_sub(keep);
+        self.history.drain(..surplus.min(self.history.len()));
+        self.history.extend(executed.into_iter().rev().take(keep).rev());
+        self.history.shrink_to(keep);
     }
 
     /// Noise seed of the episode.
@@ -86,8 +87,8 @@ impl Episode {
     /// Resident size in bytes, for the session cap.
     pub fn size_bytes(&self) -> usize {
         let floats = |values: Option<&Vec<f32>>| values.map_or(0, |values| values.capacity() * size_of::<f32>());
-        let token = |token: &Token| size_of::<Token>() + floats(token.state.as_ref()) + floats(token.action.as_ref());
-        let history: usize = self.history.iter().map(token).sum();
+        let token = |token: &Token| floats(token.state.as_ref()) + floats(token.action.as_ref());
+        let history = self.history.capacity() * size_of::<Token>() + self.history.iter().map(token).sum::<usize>();
         let planned = self.planned.as_ref();
         let planned: usize = planned.map_or(0, |p| floats(Some(&p.state)) + p.actions.iter().map(|a| 24 + floats(Some(a))).sum::<usize>());
         let window = self.window.as_ref().map_or(0, |w| [&w.x, &w.predicted_state, &w.anchor].map(|v| floats(Some(v))).iter().sum());
@@ -127,7 +128,7 @@ impl Agent {
         };
         let untrained = "and this checkpoint was not trained without: report the state in which each action was executed";
         let state = match (&step.state, planned) {
-            (Some(state), _) => Some(normalizer.state.normalize(&self.checked(&field("state"), state, layout.state_dim)?)),
+            (Some(state), _) => Some(self.state(&field("state"), state)?),
             (None, Some(planned)) if j == 0 => Some(planned.state.clone()),
             (None, _) => missing("state", trained.state, untrained)?,
         };
@@ -137,7 +138,11 @@ impl Agent {
             (None, None) => missing("action", trained.action, "and no action was returned for this step")?,
         };
         let reward = match step.reward {
-            Some(reward) => Some(normalizer.reward.normalize(&[finite(&field("reward"), reward)?])[0]),
+            Some(raw) => {
+                let reward = normalizer.reward.normalize(&[finite(&field("reward"), raw)?])[0];
+                known(&field("reward"), raw, reward)?;
+                Some(reward)
+            }
             None => (!trained.reward).then_some(0.0),
         };
         Ok(Token { state, action, reward, noise: 0.0 })

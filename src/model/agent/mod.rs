@@ -19,6 +19,9 @@ pub use types::{AgentError, Chunk, Executed, LatentMode, Observation, SamplerOpt
 
 use crate::model::{Networks, config::ModelConfig, diffusion::ladder::Ladder, diffusion::process::Process};
 
+/// Largest state or reward that is taken, in standard deviations of the data.
+const FAR_MAX: f32 = 1e6;
+
 /// A loaded model.
 pub struct Agent {
     config: ModelConfig,
@@ -82,14 +85,14 @@ impl Agent {
     /// # Errors
     /// [`AgentError::InvalidObservation`] naming the field.
     pub fn begin(&self, episode: &Episode, observation: &Observation) -> Result<Descent, AgentError> {
-        let state = self.checked("state", &observation.state, self.config.layout.state_dim)?;
+        let state = self.state("state", &observation.state)?;
         let mut episode = episode.clone();
         let executed = self.executed_tokens(&episode, observation)?;
         let aligned = executed.len() == episode.options.action_horizon;
         episode.commit(executed, self.config.block_len.max(self.config.obs_horizon));
         let ladder = Ladder::new(self.config.plan_horizon, episode.options.sub_steps, self.config.level_max);
         let ladder = ladder.map_err(|reason| AgentError::InvalidOptions { field: "sub_steps", reason })?;
-        Ok(Descent::new(episode, self.config.normalizer.state.normalize(&state), ladder, aligned, &self.config))
+        Ok(Descent::new(episode, state, ladder, aligned, &self.config))
     }
 
     /// For an act that has no time for another evaluation: gives out what there is, and says whether there was anything: positions of the
@@ -128,6 +131,21 @@ impl Agent {
         }
         values.iter().enumerate().map(|(index, value)| finite(&format!("{field}[{index}]"), *value)).collect()
     }
+
+    /// A state, normalized.
+    fn state(&self, field: &str, raw: &[f32]) -> Result<Vec<f32>, AgentError> {
+        let normalized = self.config.normalizer.state.normalize(&self.checked(field, raw, self.config.layout.state_dim)?);
+        let far = |(index, value): (usize, &f32)| known(&format!("{field}[{index}]"), raw[index], *value);
+        normalized.iter().enumerate().try_for_each(far)?;
+        Ok(normalized)
+    }
+}
+
+/// Whether a value lies anywhere near the data: one that does not is in other units, or the reading of a broken sensor, and a network that
+/// is given it answers nonsense or infinity.
+fn known(field: &str, raw: f32, normalized: f32) -> Result<(), AgentError> {
+    let reason = || format!("is {raw}, {normalized:.0e} standard deviations from the mean of the data; at most {FAR_MAX:.0e} are taken");
+    if normalized.abs() <= FAR_MAX { Ok(()) } else { Err(AgentError::InvalidObservation { field: field.into(), reason: reason() }) }
 }
 
 fn finite(field: &str, value: f32) -> Result<f32, AgentError> {

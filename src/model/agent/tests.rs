@@ -180,6 +180,13 @@ fn bad_observations_name_the_field() {
     assert_eq!(field(vec![0.0; 3], executed(None, None)), "executed[0].action");
     assert_eq!(field(vec![0.0; 3], executed(Some(vec![0.0]), None)), "executed[0].action");
     assert_eq!(field(vec![0.0; 3], executed(Some(vec![0.0; 2]), Some(f32::INFINITY))), "executed[0].reward");
+    // Finite, and beyond anything that a network can be asked.
+    assert_eq!(field(vec![0.0, -3e38, 0.0], vec![]), "state[1]");
+    assert_eq!(field(vec![0.0; 3], executed(Some(vec![0.0; 2]), Some(1e30))), "executed[0].reward");
+    let far = |state| vec![Executed { state: Some(state), action: Some(vec![3e38; 2]), reward: None }];
+    assert_eq!(field(vec![0.0; 3], far(vec![0.0, 0.0, 1e20])), "executed[0].state[2]");
+    let told = |state| Observation { state, executed: far(vec![0.0; 3]), ..Observation::default() };
+    assert!(agent.begin(&episode, &told(vec![1e6, 0.0, 0.0])).is_ok(), "actions are held within their bounds");
 }
 
 #[test]

@@ -69,6 +69,15 @@ pub struct Spec {
     pub digest: String,
 }
 
+impl Observation {
+    /// Resident size in bytes, beside its own.
+    pub fn size_bytes(&self) -> usize {
+        let floats = |values: Option<&Vec<f32>>| values.map_or(0, |values| values.capacity() * size_of::<f32>());
+        let executed = self.executed.iter().map(|step| floats(step.state.as_ref()) + floats(step.action.as_ref()));
+        floats(Some(&self.state)) + self.executed.capacity() * size_of::<Executed>() + executed.sum::<usize>()
+    }
+}
+
 /// What the client saw since its last act, raw units.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Observation {

@@ -136,8 +136,11 @@ fn rename(dir: &Path, name: &str) -> Result<(), CheckpointError> {
     renamed.map_err(|error| io(&dir.join(name), &error))
 }
 
-/// A file of at most this size.
+/// A file of at most this size. Only a regular one is opened: a pipe would keep the reader for as long as nobody writes.
 pub(super) fn read(path: &Path, bytes_max: u64) -> Result<Vec<u8>, CheckpointError> {
+    if !fs::metadata(path).map_err(|error| io(path, &error))?.is_file() {
+        return Err(invalid(path, "is no regular file"));
+    }
     let file = File::open(path).map_err(|error| io(path, &error))?;
     let mut bytes = Vec::new();
     file.take(bytes_max + 1).read_to_end(&mut bytes).map_err(|error| io(path, &error))?;

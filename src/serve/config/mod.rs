@@ -81,6 +81,8 @@ pub struct LimitsConfig {
     pub json_depth_max: usize,
     /// Acts of one ActBatch.
     pub act_batch_len_max: usize,
+    /// Steps that one act may be told of (`executed`); a model looks back on `block_len` of them at most.
+    pub executed_len_max: usize,
     /// Acts of one ActStream or WebSocket that are worked on at once; the next is read when one is answered.
     pub stream_acts_max: usize,
     /// Time for an act without `deadline_ms`. The call's own timeout, of either face, only ends it earlier.
@@ -119,6 +121,8 @@ pub struct EngineConfig {
     pub workers: usize,
     /// Acts that wait for a worker; one more is refused (QUEUE_FULL).
     pub queue_len_max: usize,
+    /// Memory of all acts that wait; treated like `queue_len_max`.
+    pub queue_bytes_max: usize,
     /// Acts that share one network evaluation of a worker.
     pub batch_len_max: usize,
     /// Whether an act with `deadline_ms` takes larger jumps, or gives out the current window, when it would come too late
@@ -194,6 +198,7 @@ impl Default for LimitsConfig {
             message_bytes_max: 1 << 20,
             json_depth_max: 64,
             act_batch_len_max: 256,
+            executed_len_max: 4096,
             stream_acts_max: 256,
             act_deadline_ms: 30_000,
             act_deadline_ms_max: 300_000,
@@ -221,6 +226,7 @@ impl Default for EngineConfig {
         Self {
             workers: 0,
             queue_len_max: 1024,
+            queue_bytes_max: 64 << 20,
             batch_len_max: 32,
             anytime: true,
             deadline_margin_ms: 1,
@@ -341,7 +347,7 @@ impl Config {
     }
 
     /// Settings that make no sense as 0.
-    fn positive(&self) -> [(&'static str, u64); 22] {
+    fn positive(&self) -> [(&'static str, u64); 24] {
         let (connection, limits, sessions, engine) = (&self.connection, &self.limits, &self.sessions, &self.engine);
         [
             ("server.connections_max", self.server.connections_max as u64),
@@ -356,6 +362,7 @@ impl Config {
             ("limits.message_bytes_max", limits.message_bytes_max as u64),
             ("limits.json_depth_max", limits.json_depth_max as u64),
             ("limits.act_batch_len_max", limits.act_batch_len_max as u64),
+            ("limits.executed_len_max", limits.executed_len_max as u64),
             ("limits.stream_acts_max", limits.stream_acts_max as u64),
             ("limits.act_deadline_ms", limits.act_deadline_ms),
             ("sessions.len_max", sessions.len_max as u64),
@@ -363,6 +370,7 @@ impl Config {
             ("sessions.ttl_ms", sessions.ttl_ms),
             ("sessions.reap_interval_ms", sessions.reap_interval_ms),
             ("engine.queue_len_max", engine.queue_len_max as u64),
+            ("engine.queue_bytes_max", engine.queue_bytes_max as u64),
             ("engine.batch_len_max", engine.batch_len_max as u64),
             ("engine.retry_after_ms", engine.retry_after_ms),
             ("engine.heartbeat_age_ms_max", engine.heartbeat_age_ms_max),

@@ -30,7 +30,9 @@ impl Costs {
             for _ in 0..ROUNDS {
                 let mut descents = descents(agent, len)?;
                 start = start.min(timed(|| agent.advance(&mut descents))?);
-                descents.retain(|descent| !descent.is_done());
+                // One that is done after a single evaluation has failed, or is a whole act.
+                let done = descents.extract_if(.., |descent| descent.is_done());
+                done.map(|descent| agent.finish(descent)).try_for_each(|acted| acted.map(drop))?;
                 // Where one evaluation makes a whole act, every tick is a first one.
                 tick = if descents.len() == len { tick.min(timed(|| agent.advance(&mut descents))?) } else { start };
                 if tick > LONG {
@@ -98,9 +100,10 @@ fn timed(work: impl FnOnce() -> Result<(), AgentError>) -> Result<Duration, Agen
     Ok(begin.elapsed())
 }
 
-/// First acts of as many sessions, in the middle of what the model knows.
+/// First acts of as many sessions, within what the model knows: one standard deviation off the mean.
 fn descents(agent: &Agent, len: usize) -> Result<Vec<Descent>, AgentError> {
-    let observation = Observation { state: agent.config().normalizer.state.mean.clone(), ..Observation::default() };
+    let known = &agent.config().normalizer.state;
+    let observation = Observation { state: known.denormalize(&vec![1.0; known.mean.len()]), ..Observation::default() };
     let begin = |seed| agent.begin(&agent.open(seed, &agent.spec().sampler)?, &observation);
     (0..len as u64).map(begin).collect()
 }

@@ -12,10 +12,10 @@ mod worker;
 
 use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode, Observation};
 use parking_lot::Mutex;
-use queue::Queue;
+use queue::{Bounds, Place, Queue};
 use std::{
     sync::{
-        Arc,
+        Arc, Weak,
         atomic::{AtomicU64, Ordering},
         mpsc,
     },
@@ -98,6 +98,19 @@ pub enum Failure {
     Stopped,
 }
 
+/// An act that was submitted: the way to take it back.
+pub struct Waiting<T: Ticket> {
+    shared: Weak<Shared<T>>,
+    place: Place,
+}
+
+impl<T: Ticket> Waiting<T> {
+    /// Leaves the queue, if it still waits there. In a batch an act that is not wanted is dropped before the next evaluation.
+    pub fn leave(self) {
+        drop(self.shared.upgrade().and_then(|shared| shared.queue.withdraw(self.place)));
+    }
+}
+
 /// The engine. Dropping it ends its threads after their current tick.
 pub struct Engine<T: Ticket> {
     shared: Arc<Shared<T>>,
@@ -111,6 +124,8 @@ pub struct EngineOptions {
     pub workers: usize,
     /// Acts that wait.
     pub queue_len_max: usize,
+    /// Their memory together.
+    pub queue_bytes_max: usize,
     /// Acts of a batch.
     pub batch_len_max: usize,
     /// Time kept for what follows the last evaluation of an act in a hurry: commit and answer.
@@ -139,7 +154,7 @@ impl<T: Ticket> Engine<T> {
     pub fn start(options: EngineOptions) -> std::io::Result<Self> {
         let workers = options.workers;
         let shared = Arc::new(Shared {
-            queue: Queue::new(options.queue_len_max, workers),
+            queue: Queue::new(Bounds { len: options.queue_len_max, bytes: options.queue_bytes_max }, workers),
             options,
             warm_ups: (0..workers).map(|_| Mutex::new(Some(Vec::new()))).collect(),
             epoch: Instant::now(),
@@ -171,9 +186,10 @@ impl<T: Ticket> Engine<T> {
     ///
     /// # Errors
     /// If the queue is full or the engine has ended; the job comes back.
-    pub fn submit(&self, job: Job<T>) -> Result<(), (Refusal, Box<Job<T>>)> {
-        let turn_by = job.turn_by;
-        self.shared.queue.push(Box::new(job), turn_by, |waiting| waiting.ticket.is_wanted())
+    pub fn submit(&self, job: Job<T>) -> Result<Waiting<T>, (Refusal, Box<Job<T>>)> {
+        let (turn_by, bytes) = (job.turn_by, size_of::<Job<T>>() + job.question.observation.size_bytes() + job.descent.size_bytes());
+        let place = self.shared.queue.push(Box::new(job), turn_by, bytes)?;
+        Ok(Waiting { shared: Arc::downgrade(&self.shared), place })
     }
 
     /// Acts that wait, and acts in batches.

@@ -2,8 +2,7 @@
 
 use parking_lot::{Condvar, Mutex};
 use std::{
-    cmp::{Ordering, Reverse},
-    collections::BinaryHeap,
+    collections::BTreeMap,
     time::{Duration, Instant},
 };
 
@@ -13,58 +12,79 @@ const IDLE_WAIT: Duration = Duration::from_millis(250);
 /// Why a job was not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
-    /// The bound is reached.
+    /// A bound is reached.
     Full,
     /// The engine has ended.
     Closed,
 }
 
+/// What may wait.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Bounds {
+    pub len: usize,
+    /// Memory of all that waits together.
+    pub bytes: usize,
+}
+
+/// Where a job waits: in order of deadlines, and among equal ones the first come first. A deadline is a point in time, so whoever waits
+/// comes to be the first of all: nobody starves.
+pub(super) type Place = (Instant, u64);
+
 /// See the module.
 pub(super) struct Queue<J> {
     inner: Mutex<Inner<J>>,
     ready: Condvar,
-    len_max: usize,
-}
-
-/// A job that waits. A deadline is a point in time, so whoever waits comes to be the first of all: nobody starves.
-struct Waiting<J> {
-    turn_by: Instant,
-    /// Among equal deadlines the first come is the first served.
-    number: u64,
-    job: J,
+    bounds: Bounds,
 }
 
 struct Inner<J> {
-    jobs: BinaryHeap<Reverse<Waiting<J>>>,
+    /// Jobs with their memory.
+    jobs: BTreeMap<Place, (usize, J)>,
+    bytes: usize,
     arrivals: u64,
     /// Jobs in the batch of each worker.
     running: Vec<usize>,
     closed: bool,
 }
 
+impl<J> Inner<J> {
+    fn pop(&mut self) -> Option<J> {
+        let (_, (bytes, job)) = self.jobs.pop_first()?;
+        self.bytes -= bytes;
+        Some(job)
+    }
+}
+
 impl<J> Queue<J> {
-    pub fn new(len_max: usize, workers: usize) -> Self {
-        let inner = Inner { jobs: BinaryHeap::new(), arrivals: 0, running: vec![0; workers], closed: false };
-        Self { inner: Mutex::new(inner), ready: Condvar::new(), len_max }
+    pub fn new(bounds: Bounds, workers: usize) -> Self {
+        let inner = Inner { jobs: BTreeMap::new(), bytes: 0, arrivals: 0, running: vec![0; workers], closed: false };
+        Self { inner: Mutex::new(inner), ready: Condvar::new(), bounds }
     }
 
-    /// Adds a job; before it is refused for want of room, jobs that nobody wants any more make room.
-    pub fn push(&self, job: J, turn_by: Instant, is_wanted: impl Fn(&J) -> bool) -> Result<(), (Refusal, J)> {
+    /// Adds a job that takes `bytes` of memory; its place, to withdraw it. A refusal looks at two numbers and at no job.
+    pub fn push(&self, job: J, turn_by: Instant, bytes: usize) -> Result<Place, (Refusal, J)> {
         let mut inner = self.inner.lock();
         if inner.closed {
             return Err((Refusal::Closed, job));
         }
-        if inner.jobs.len() >= self.len_max {
-            inner.jobs.retain(|Reverse(waiting)| is_wanted(&waiting.job));
-        }
-        if inner.jobs.len() >= self.len_max {
+        let is_too_much = inner.bytes + bytes > self.bounds.bytes && !inner.jobs.is_empty();
+        if inner.jobs.len() >= self.bounds.len || is_too_much {
             return Err((Refusal::Full, job));
         }
         inner.arrivals += 1;
-        let number = inner.arrivals;
-        inner.jobs.push(Reverse(Waiting { turn_by, number, job }));
+        inner.bytes += bytes;
+        let place = (turn_by, inner.arrivals);
+        inner.jobs.insert(place, (bytes, job));
         self.ready.notify_one();
-        Ok(())
+        Ok(place)
+    }
+
+    /// Takes a job back, if it still waits.
+    pub fn withdraw(&self, place: Place) -> Option<J> {
+        let mut inner = self.inner.lock();
+        let (bytes, job) = inner.jobs.remove(&place)?;
+        inner.bytes -= bytes;
+        Some(job)
     }
 
     /// Jobs for a worker that holds `held` jobs now and has `room` for more; None: the end. Waits only if it holds none.
@@ -84,8 +104,7 @@ impl<J> Queue<J> {
         if inner.jobs.len() > count {
             self.ready.notify_one();
         }
-        let earliest = std::iter::from_fn(|| inner.jobs.pop()).take(count);
-        Some(earliest.map(|Reverse(waiting)| waiting.job).collect())
+        Some(std::iter::from_fn(|| inner.pop()).take(count).collect())
     }
 
     /// Whether it has ended.
@@ -109,60 +128,60 @@ impl<J> Queue<J> {
         let mut inner = self.inner.lock();
         inner.closed = true;
         self.ready.notify_all();
-        inner.jobs.drain().map(|Reverse(waiting)| waiting.job).collect()
+        std::iter::from_fn(|| inner.pop()).collect()
     }
 }
-
-impl<J> Ord for Waiting<J> {
-    fn cmp(&self, other: &Self) -> Ordering {
-        (self.turn_by, self.number).cmp(&(other.turn_by, other.number))
-    }
-}
-
-impl<J> PartialOrd for Waiting<J> {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl<J> PartialEq for Waiting<J> {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other) == Ordering::Equal
-    }
-}
-
-impl<J> Eq for Waiting<J> {}
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn queue(len: usize, workers: usize) -> Queue<i32> {
+        Queue::new(Bounds { len, bytes: 100 }, workers)
+    }
+
     #[test]
-    fn bound_and_unwanted() {
-        let (queue, now) = (Queue::new(2, 1), Instant::now());
-        let wanted = |job: &i32| *job != 1;
-        assert!(queue.push(1, now, wanted).is_ok() && queue.push(2, now, wanted).is_ok());
-        assert!(queue.push(3, now, wanted).is_ok(), "1 makes room");
-        assert_eq!(queue.push(4, now, wanted), Err((Refusal::Full, 4)));
+    fn bounded_and_left_at_once() {
+        let (queue, now) = (queue(2, 1), Instant::now());
+        let first = queue.push(1, now, 1).unwrap();
+        assert!(queue.push(2, now, 1).is_ok());
+        assert_eq!(queue.push(3, now, 1), Err((Refusal::Full, 3)));
+        assert_eq!((queue.withdraw(first), queue.withdraw(first)), (Some(1), None));
+        assert!(queue.push(3, now, 1).is_ok(), "who leaves makes room");
+        assert_eq!(queue.push(4, now, 1), Err((Refusal::Full, 4)));
         assert_eq!(queue.take(0, 0, 8), Some(vec![2, 3]));
         assert_eq!(queue.load(), (0, 2));
         assert_eq!(queue.take(0, 1, 8), Some(vec![]), "does not wait while it holds one");
         assert_eq!(queue.load(), (0, 1));
         assert_eq!(queue.close(), Vec::<i32>::new());
-        assert_eq!(queue.push(5, now, wanted), Err((Refusal::Closed, 5)));
+        assert_eq!(queue.push(5, now, 1), Err((Refusal::Closed, 5)));
         assert_eq!(queue.take(0, 0, 8), None);
+    }
+
+    /// An act may be told of thousands of steps: what waits is bounded in bytes too, but whatever fits into a message has its turn alone.
+    #[test]
+    fn bounded_in_bytes() {
+        let (queue, now) = (queue(9, 1), Instant::now());
+        let large = queue.push(1, now, 1000).unwrap();
+        assert_eq!(queue.push(2, now, 1), Err((Refusal::Full, 2)));
+        queue.withdraw(large);
+        assert!(queue.push(3, now, 60).is_ok() && queue.push(4, now, 40).is_ok());
+        assert_eq!(queue.push(5, now, 1), Err((Refusal::Full, 5)));
+        assert_eq!(queue.take(0, 0, 1), Some(vec![3]));
+        assert!(queue.push(6, now, 60).is_ok());
+        assert_eq!(queue.close(), [4, 6]);
     }
 
     #[test]
     fn workers_share() {
-        let (queue, now) = (Queue::new(16, 2), Instant::now());
+        let (queue, now) = (queue(16, 2), Instant::now());
         for job in 0..5 {
-            queue.push(job, now, |_| true).unwrap();
+            queue.push(job, now, 1).unwrap();
         }
         assert_eq!(queue.take(0, 0, 8).unwrap().len(), 3);
         assert_eq!(queue.take(1, 0, 8).unwrap().len(), 2);
         for job in 0..9 {
-            queue.push(job, now, |_| true).unwrap();
+            queue.push(job, now, 1).unwrap();
         }
         assert_eq!(queue.take(0, 2, 1).unwrap().len(), 1, "no more than there is room");
         assert_eq!(queue.load(), (8, 5));
@@ -174,17 +193,17 @@ mod tests {
     /// as soon as its own deadline is the earliest.
     #[test]
     fn earliest_deadline_first_and_nobody_starves() {
-        let (queue, now) = (Queue::new(64, 1), Instant::now());
+        let (queue, now) = (queue(64, 1), Instant::now());
         let at = |ms| now + Duration::from_millis(ms);
         for (job, ms) in [(1, 30), (2, 10), (3, 20), (4, 10)] {
-            queue.push(job, at(ms), |_| true).unwrap();
+            queue.push(job, at(ms), 1).unwrap();
         }
         assert_eq!(queue.take(0, 0, 3), Some(vec![2, 4, 3]));
         assert_eq!(queue.take(0, 0, 3), Some(vec![1]));
-        queue.push(0, at(100), |_| true).unwrap();
+        queue.push(0, at(100), 1).unwrap();
         let mut turns = 0;
         for arrival in 1.. {
-            queue.push(arrival, at(arrival as u64 * 10 + 5), |_| true).unwrap();
+            queue.push(arrival, at(arrival as u64 * 10 + 5), 1).unwrap();
             turns += 1;
             if queue.take(0, 0, 1).unwrap() == [0] {
                 break;

@@ -28,17 +28,34 @@ pub struct Flight {
     /// When its answer is late for everyone who waits, if all of them prefer a coarser one in time.
     due: Mutex<Option<Instant>>,
     outcome: watch::Sender<Option<Outcome>>,
+    /// Takes the act out of the queue.
+    leave: Mutex<Option<Box<dyn FnOnce() + Send>>>,
 }
 
 impl Flight {
     pub(super) fn new(step: u64, key: Key, arrived: Instant, due: Option<Instant>) -> Arc<Self> {
         let (waiters, computing, outcome) = (AtomicUsize::new(1), AtomicBool::new(false), watch::Sender::new(None));
-        Arc::new(Self { step, key, arrived, waiters, computing, due: Mutex::new(due), outcome })
+        Arc::new(Self { step, key, arrived, waiters, computing, due: Mutex::new(due), outcome, leave: Mutex::new(None) })
     }
 
     /// Whether somebody waits and there is no outcome yet.
     pub fn is_wanted(&self) -> bool {
         self.waiters.load(Ordering::Acquire) > 0 && self.outcome.borrow().is_none()
+    }
+
+    /// It waits for a worker; `leave` is called once nobody wants it any more.
+    pub fn waits(&self, leave: impl FnOnce() + Send + 'static) {
+        *self.leave.lock() = Some(Box::new(leave));
+        if !self.is_wanted() {
+            self.leave();
+        }
+    }
+
+    fn leave(&self) {
+        let leave = self.leave.lock().take();
+        if let Some(leave) = leave {
+            leave();
+        }
     }
 
     /// Marks that it left the queue.
@@ -71,6 +88,7 @@ impl Flight {
             }
             first
         });
+        self.leave();
     }
 }
 
@@ -111,6 +129,7 @@ impl Drop for Waiter {
         if self.flight.waiters.fetch_sub(1, Ordering::AcqRel) == 1 && self.flight.outcome.borrow().is_none() {
             metrics::counter!("ada_cancelled_total", "stage" => self.flight.stage().word()).increment(1);
             self.session.slot.lock().release(&self.flight);
+            self.flight.leave();
         }
     }
 }

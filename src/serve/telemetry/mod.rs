@@ -104,7 +104,12 @@ pub fn install_log(config: &TelemetryConfig, out: impl Write + Send + 'static) -
     }
     panic::set_hook(Box::new(|panic| {
         let place = panic.location().map(ToString::to_string).unwrap_or_default();
-        tracing::error!(place, thread = std::thread::current().name().unwrap_or_default(), "panic: {}", panic.payload_as_str().unwrap_or("?"));
+        tracing::error!(
+            place,
+            thread = std::thread::current().name().unwrap_or_default(),
+            "panic: {}",
+            panic.payload_as_str().unwrap_or("?")
+        );
     }));
     Ok(Log(Some(lines)))
 }

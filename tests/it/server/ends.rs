@@ -1,4 +1,4 @@
-//! What becomes of the server when something around it ends: the reader of its log, the disk that the log is on, a thread.
+//! What becomes of the server when something around it is broken: the reader of its log, the disk that the log is on, a thread, a model.
 
 use super::*;
 use std::{fs::File, net::TcpListener, time::Instant};
@@ -86,4 +86,42 @@ async fn a_silent_engine_is_not_ready() {
         }
     }
     assert_eq!((said.status, said.text.as_str()), (503, "a worker of the engine is silent\n"));
+}
+
+/// Broken models beside a good one cost themselves alone. One number too large ended the process; a pipe held up the start for ever; a model
+/// that cannot act was served.
+#[tokio::test(flavor = "multi_thread")]
+async fn broken_models_cost_themselves() {
+    let dir = tempfile::tempdir().unwrap();
+    let tiny: ModelConfig = serde_json::from_slice(&fs::read("models/tiny/config.json").unwrap()).unwrap();
+    alter(&dir.path().join("tiny"), &tiny, 1.0);
+    let mut noisy = tiny.clone();
+    noisy.sampler.temperature = 10.0;
+    // Its output is not finite for any state.
+    alter(&dir.path().join("never-finite"), &noisy, 3e38);
+    let absurd: [(&str, fn(&mut ModelConfig)); 6] = [
+        ("levels", |config| config.level_max = 1_000_000_000_000),
+        ("block", |config| config.block_len = 1 << 62),
+        ("horizon", |config| config.plan_horizon = usize::MAX / 2),
+        ("sub-steps", |config| config.sampler.sub_steps = (1 << 61) + 1),
+        ("clip", |config| config.state_clip = f32::INFINITY),
+        ("bounds", |config| config.action_low[0] = f32::NEG_INFINITY),
+    ];
+    for (name, change) in absurd {
+        let mut config = tiny.clone();
+        change(&mut config);
+        alter(&dir.path().join(name), &config, 1.0);
+    }
+    for file in ["config.json", "manifest.json", "model.safetensors"] {
+        let pipe = dir.path().join(format!("pipe-{}", &file[..5]));
+        alter(&pipe, &tiny, 1.0);
+        fs::remove_file(pipe.join(file)).unwrap();
+        assert!(Command::new("mkfifo").arg(pipe.join(file)).status().unwrap().success());
+    }
+    let server = start(|config| config.models.dir = dir.path().into()).await;
+    let listed = server.get("/v1/models").await.json()["models"].clone();
+    let names: Vec<_> = listed.as_array().unwrap().iter().map(|model| model["name"].as_str().unwrap()).collect();
+    assert_eq!(names, ["tiny"]);
+    let id = server.open(json!({})).await;
+    assert_eq!(server.act(&id, 1, &STATE).await.status, 200);
 }

@@ -79,7 +79,8 @@ fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Recei
 }
 
 fn one_worker(batch_len_max: usize) -> Engine<Seat> {
-    Engine::start(EngineOptions { workers: 1, queue_len_max: 64, batch_len_max, deadline_margin: Duration::ZERO }).unwrap()
+    Engine::start(EngineOptions { workers: 1, queue_len_max: 64, queue_bytes_max: 1 << 20, batch_len_max, deadline_margin: Duration::ZERO })
+        .unwrap()
 }
 
 /// An act of another model makes the shared forward fail; its batch mates are answered as if it had not been there.

@@ -269,6 +269,36 @@ async fn messages_that_are_too_large_or_none() {
     assert_eq!(failure(&malformed), (Code::InvalidArgument, "REQUEST_INVALID".into()));
 }
 
+/// What is told of the past is bounded in number: an act of 74,000 empty steps took 8 MB while it waited, and kept 5 for the session's life.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_long_past_is_refused_and_a_permitted_one_leaves_no_memory() {
+    let server = start(|_| {}).await;
+    let id = server.open(json!({})).await;
+    let told = |steps: usize| {
+        let executed = vec![pb::Executed { reward: Some(0.5), action: Some(pb::Vector { values: vec![0.0; 2] }), state: None }; steps];
+        let mut request = act(&id, 1, &STATE);
+        request.observation.as_mut().unwrap().executed = executed;
+        request
+    };
+    let grpc = server.agent().await.act(told(4097)).await.unwrap_err();
+    let body = json!({"step": 1, "observation": {"state": STATE, "executed": vec![json!({"reward": 0.5, "action": [0, 0]}); 4097]}});
+    let http = server.post(&format!("/v1/sessions/{id}/act"), &body).await;
+    both(&grpc, &http, (Code::ResourceExhausted, 413, "TOO_LARGE"));
+    assert_eq!(server.agent().await.act(told(4096)).await.unwrap().into_inner().step, 1, "nothing was lost");
+    let session = server.get(&format!("/v1/sessions/{id}")).await.json()["session"].clone();
+    assert!(session["state_bytes"].as_u64().unwrap() < 10_000, "{session}");
+}
+
+/// A value far from all data is a wrong unit or a broken sensor, and its name is told; once the network was asked, and the answer was a 500.
+#[tokio::test(flavor = "multi_thread")]
+async fn values_far_from_the_data_are_refused_by_name() {
+    let server = start(|_| {}).await;
+    let id = server.open(json!({})).await;
+    let (grpc, http) = refused(&server, &id, 1, &[0.0, 1e30, 0.0, 0.0], (Code::InvalidArgument, 400, "OBSERVATION_INVALID")).await;
+    assert!(grpc.message().contains("standard deviations") && http.json()["field"] == "observation.state[1]", "{http:?}");
+    assert_eq!(server.act(&id, 1, &STATE).await.status, 200);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_full_queue_and_passed_deadlines() {
     let (_process, server) = start_process(&["engine.workers=1", "engine.queue_len_max=1", "engine.anytime=false"]).await;
@@ -305,8 +335,7 @@ async fn a_timeout_of_a_call_is_no_deadline() {
     config.engine.deadline_margin_ms = 200;
     let registry = Registry::load(&config.models).unwrap();
     let service = Arc::new(Service::start(config).unwrap());
-    service.warm_up(&registry);
-    service.set_registry(registry);
+    service.set_registry(service.warm_up(registry).unwrap());
     let (router, _) = grpc::router(service).unwrap();
     let mut agent = AgentClient::new(router);
     let open = pb::OpenSessionRequest { model: "slow".into(), ..Default::default() };
@@ -355,7 +384,7 @@ async fn a_deadline_gets_a_degraded_answer() {
 async fn an_output_that_is_not_finite() {
     let server = start(|_| {}).await;
     let (bad, good) = (server.open(json!({"model": "exploding"})).await, server.open(json!({})).await);
-    let (grpc, http) = refused(&server, &bad, 1, &STATE, (Code::Internal, 500, "NONFINITE_OUTPUT")).await;
+    let (grpc, http) = refused(&server, &bad, 1, &EXPLODING_STATE, (Code::Internal, 500, "NONFINITE_OUTPUT")).await;
     assert!(trailer(&grpc, "ada-error-id").is_some() && http.json()["error_id"].is_string());
     assert_eq!(server.get(&format!("/v1/sessions/{bad}")).await.json()["session"]["committed_step"], 0);
     assert_eq!(server.act(&good, 1, &STATE).await.status, 200);

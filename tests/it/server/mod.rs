@@ -40,10 +40,13 @@ use tonic::{Code, Status, transport::Channel};
 pub const STATE: [f32; 4] = [0.1, -0.2, 0.3, 0.4];
 /// A state, rare but possible, for which the output of the model `exploding` is not finite.
 pub const EXPLODING_STATE: [f32; 4] = [1e5, -1e5, 1e5, 1e5];
+/// What leads from the input straight to the output.
+const SKIP: &str = "denoiser.input_skip.weight";
 /// Steps per rung with which the model `slow` takes minutes for an act.
 const SLOW_SUB_STEPS: usize = 25_000;
 
-/// A directory of models: `tiny`, `slow` (an act takes minutes), `exploding` (its output is not finite) and `torn` (refused).
+/// A directory of models: `tiny`, `slow` (an act takes minutes), `exploding` (its output is not finite for
+/// [`EXPLODING_STATE`]) and `torn` (refused).
 pub fn models_dir() -> &'static Path {
     static DIR: OnceLock<tempfile::TempDir> = OnceLock::new();
     DIR.get_or_init(|| {
@@ -55,7 +58,7 @@ pub fn models_dir() -> &'static Path {
         slow.level_max = SLOW_SUB_STEPS * slow.plan_horizon;
         slow.sampler.sub_steps = SLOW_SUB_STEPS;
         alter(&dir.path().join("slow"), &slow, 1.0);
-        alter(&dir.path().join("exploding"), &config, 1e30);
+        alter(&dir.path().join("exploding"), &config, 1e34);
         copy(&tiny, &dir.path().join("torn"));
         let weights = dir.path().join("torn/model.safetensors");
         let mut bytes = fs::read(&weights).unwrap();
@@ -74,20 +77,18 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// `tiny` with another configuration and scaled weights, written by hand: the program tries an act of what it writes, which of these takes
-/// minutes or fails.
-fn alter(dir: &Path, config: &ModelConfig, scale: f32) {
+/// `tiny` with another configuration and a factor on its input skip, written by hand: the program tries an act of what it writes.
+fn alter(dir: &Path, config: &ModelConfig, skip: f32) {
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("models/tiny"), dir);
     let (mut manifest, _) = checkpoint::load_manifest(dir).unwrap();
     let mut weights = fs::read(dir.join("model.safetensors")).unwrap();
-    let header = 8 + usize::try_from(u64::from_le_bytes(*weights.first_chunk().unwrap())).unwrap();
-    for value in weights[header..].as_chunks_mut().0 {
-        *value = (f32::from_le_bytes(*value) * scale).to_le_bytes();
+    let tensor = SafeTensors::deserialize(&weights).unwrap().tensor(SKIP).unwrap().data().as_ptr_range();
+    let base = weights.as_ptr() as usize;
+    let skip_bytes = &mut weights[tensor.start as usize - base..tensor.end as usize - base];
+    for value in skip_bytes.as_chunks_mut().0 {
+        *value = (f32::from_le_bytes(*value) * skip).to_le_bytes();
     }
-    let tensors = SafeTensors::deserialize(&weights).unwrap();
-    for (name, digest) in &mut manifest.tensors {
-        digest.sha256 = sha256(tensors.tensor(name).unwrap().data());
-    }
+    manifest.tensors.get_mut(SKIP).unwrap().sha256 = sha256(skip_bytes);
     for (name, bytes) in [("config.json", serde_json::to_vec(config).unwrap()), ("model.safetensors", weights)] {
         manifest.files.insert(name.to_owned(), sha256(&bytes));
         fs::write(dir.join(name), bytes).unwrap();

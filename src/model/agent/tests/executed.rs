@@ -106,3 +106,19 @@ fn a_primed_session_goes_on_as_the_one_that_lived_it() {
     let told = (0..5).map(|t| step(Some(state(t)), action(t))).collect();
     assert_eq!(agent.act(&open(), &seen(state(5), told)).unwrap(), lived);
 }
+
+/// An act that is told of thousands of steps keeps what its model looks back on, and counts what it keeps: a session once kept 4.8 MB, and was
+/// counted as 872 bytes.
+#[test]
+fn a_long_past_leaves_no_memory() {
+    let agent = agent(true, 1, unet());
+    let fresh = agent.open(1, &options()).unwrap();
+    let long: Vec<_> = (0..5000).map(|t| step(Some([t as f32 / 1e4; 3]), [0.1, 0.2])).collect();
+    let last = long[long.len() - 4..].to_vec();
+    let (episode, chunk) = agent.act(&fresh, &seen([0.1; 3], long)).unwrap();
+    assert_eq!((episode.history.len(), episode.time()), (4, 5000));
+    assert!(episode.history.capacity() <= 8, "{}", episode.history.capacity());
+    let (short, same) = agent.act(&Episode { time: 4996, ..fresh }, &seen([0.1; 3], last)).unwrap();
+    assert!(chunk == same && episode.history == short.history);
+    assert!(episode.size_bytes() <= short.size_bytes() + 8 * size_of_val(&episode.history[0]));
+}
