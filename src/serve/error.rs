@@ -36,6 +36,16 @@ pub enum ServiceError {
         /// Where the session stands.
         committed: u64,
     },
+    /// It came late: the session was reset meanwhile.
+    #[error("episode {episode} does not run; {running} does, at step {committed}")]
+    EpisodeOver {
+        /// What was sent.
+        episode: u64,
+        /// What runs.
+        running: u64,
+        /// Where it stands.
+        committed: u64,
+    },
     /// Open a session.
     #[error("no such session: it was closed, or is of a server that ended since (a restart ends all sessions)")]
     SessionNotFound,
@@ -174,6 +184,7 @@ impl ServiceError {
             Self::StepOutOfOrder { .. } => "STEP_OUT_OF_ORDER",
             Self::SessionBusy { .. } => "SESSION_BUSY",
             Self::StepPayloadMismatch { .. } => "STEP_PAYLOAD_MISMATCH",
+            Self::EpisodeOver { .. } => "EPISODE_OVER",
             Self::SessionNotFound => "SESSION_NOT_FOUND",
             Self::SessionExpired => "SESSION_EXPIRED",
             Self::SessionEvicted => "SESSION_EVICTED",
@@ -200,11 +211,17 @@ impl ServiceError {
     /// Where the session stands, for errors about steps.
     pub fn committed_step(&self) -> Option<u64> {
         match self {
-            Self::StepOutOfOrder { committed, .. } | Self::SessionBusy { committed } | Self::StepPayloadMismatch { committed, .. } => {
-                Some(*committed)
-            }
+            Self::StepOutOfOrder { committed, .. }
+            | Self::SessionBusy { committed }
+            | Self::StepPayloadMismatch { committed, .. }
+            | Self::EpisodeOver { committed, .. } => Some(*committed),
             _ => None,
         }
+    }
+
+    /// The episode that runs, for errors about episodes.
+    pub fn episode(&self) -> Option<u64> {
+        if let Self::EpisodeOver { running, .. } = self { Some(*running) } else { None }
     }
 
     /// When to try the same again, for errors that pass by themselves.
@@ -251,6 +268,7 @@ impl ServiceError {
             (Self::StepOutOfOrder { step, committed }, 10, 409, "STEP_OUT_OF_ORDER"),
             (Self::SessionBusy { committed }, 10, 409, "SESSION_BUSY"),
             (Self::StepPayloadMismatch { step, committed }, 9, 422, "STEP_PAYLOAD_MISMATCH"),
+            (Self::EpisodeOver { episode: 1, running: 2, committed }, 10, 409, "EPISODE_OVER"),
             (Self::SessionNotFound, 5, 404, "SESSION_NOT_FOUND"),
             (Self::SessionExpired, 5, 410, "SESSION_EXPIRED"),
             (Self::SessionEvicted, 5, 410, "SESSION_EVICTED"),

@@ -67,6 +67,23 @@ pub struct OpenRequest {
     pub options: OptionsPatch,
     /// Idle time to live; None: the configured one.
     pub ttl_ms: Option<u64>,
+    /// The client's name for this request; empty: none.
+    pub request_id: String,
+}
+
+/// ResetSession.
+#[derive(Clone, Debug, Default)]
+pub struct ResetRequest {
+    /// Id of the session, as the client wrote it.
+    pub session_id: String,
+    /// Noise seed of the new episode; None: drawn.
+    pub seed: Option<u64>,
+    /// Whether the latent goes on looking back on the old one.
+    pub keep_history: bool,
+    /// The client's name for this request; empty: none.
+    pub request_id: String,
+    /// The episode that it ends; None: the running one.
+    pub episode: Option<u64>,
 }
 
 /// Act.
@@ -76,6 +93,8 @@ pub struct ActRequest {
     pub session_id: String,
     /// Committed step + 1, or the committed step again.
     pub step: u64,
+    /// The episode that it belongs to; None: the running one.
+    pub episode: Option<u64>,
     /// What was seen.
     pub observation: Observation,
     /// Time it may take, in which a coarser answer is better than none; None: the configured one, and no coarser answer.

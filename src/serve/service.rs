@@ -7,7 +7,7 @@ use crate::{
         engine::{Engine, EngineOptions, Failure, Job, Question, Refusal},
         error::{ServiceError, Stage},
         registry::{Model, Registry, RegistryError},
-        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page},
+        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page, ResetRequest},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
         session::{Answer, Entry, Opening, Session, Sessions, Summary, Waiter, key_of},
         telemetry,
@@ -24,8 +24,10 @@ use uuid::Uuid;
 
 /// Seeds drawn by the server stay below 2^53, so that every JSON reader keeps them exactly.
 const DRAWN_SEED_BITS: u32 = 53;
+/// Longest name that a client may give a request.
+const REQUEST_ID_LEN_MAX: usize = 64;
 const PAGE_LEN: usize = 100;
-const PAGE_LEN_MAX: usize = 1_000;
+const PAGE_LEN_MAX: usize = 100;
 
 /// The service: models, sessions and the engine between them.
 pub struct Service {
@@ -152,12 +154,13 @@ impl Service {
     /// # Errors
     /// `ModelNotFound`, `Invalid`, `Quota`, `NotReady`, `Draining`.
     pub fn open(&self, request: OpenRequest) -> Result<(Summary, Model), ServiceError> {
-        let OpenRequest { model, seed, options, ttl_ms } = request;
+        let OpenRequest { model, seed, options, ttl_ms, request_id } = request;
+        check_request_id(&request_id)?;
         let model = self.model(&model)?;
         let ttl = self.ttl(ttl_ms)?;
         let options = options.onto(&model.agent.spec().sampler);
         let episode = model.agent.open(seed.unwrap_or_else(draw_seed), &options).map_err(ServiceError::from_agent)?;
-        let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, options, ttl };
+        let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, options, ttl, request_id };
         let now = Instant::now();
         let session = self.sessions.open(opening, now)?;
         Ok((session.summary(now), model))
@@ -207,12 +210,15 @@ impl Service {
     /// ResetSession.
     ///
     /// # Errors
-    /// `SessionNotFound` and its kin, `SessionBusy`, `Draining`.
-    pub fn reset(&self, session_id: &str, seed: Option<u64>, keep_history: bool) -> Result<Summary, ServiceError> {
+    /// `SessionNotFound` and its kin, `SessionBusy`, `EpisodeOver`, `Invalid`, `Draining`.
+    pub fn reset(&self, request: ResetRequest) -> Result<Summary, ServiceError> {
+        let ResetRequest { session_id, seed, keep_history, request_id, episode } = request;
         self.registry()?;
-        let session = self.session(session_id)?;
+        check_request_id(&request_id)?;
+        let session = self.session(&session_id)?;
         let now = Instant::now();
-        session.reset(|episode: &Episode| session.agent.reset(episode, seed.unwrap_or_else(draw_seed), keep_history), now)?;
+        let renew = |episode: &Episode| session.agent.reset(episode, seed.unwrap_or_else(draw_seed), keep_history);
+        session.reset(renew, episode, request_id, now)?;
         Ok(session.summary(now))
     }
 
@@ -262,7 +268,7 @@ impl Service {
     }
 
     async fn act_on(&self, session: &Arc<Session>, request: ActRequest, arrived: Instant) -> Result<Acted, ServiceError> {
-        let ActRequest { step, observation, deadline, timeout, want_planned_states, .. } = request;
+        let ActRequest { step, episode, observation, deadline, timeout, want_planned_states, .. } = request;
         let limits = &self.config.limits;
         if observation.executed.len() > limits.executed_len_max {
             metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
@@ -277,7 +283,7 @@ impl Service {
         }
         let acted = |answer, replayed| Acted { answer, replayed, want_planned_states };
         let due = deadline.filter(|_| self.config.engine.anytime).map(|_| arrived + patience);
-        let (waiter, replayed) = match session.enter(step, key_of(&observation), arrived, due)? {
+        let (waiter, replayed) = match session.enter((episode, step), key_of(&observation), arrived, due)? {
             Entry::Replay(answer) => {
                 metrics::counter!("ada_replays_total", "source" => "memory").increment(1);
                 return Ok(acted(answer, true));
@@ -350,6 +356,12 @@ async fn wait(waiter: &Waiter, deadline: Instant) -> Result<Arc<Answer>, Service
 
 fn parse_id(session_id: &str) -> Result<Uuid, ServiceError> {
     Uuid::try_parse(session_id).map_err(|_| ServiceError::SessionNotFound)
+}
+
+/// A name that a log and a header can hold; empty: none.
+fn check_request_id(id: &str) -> Result<(), ServiceError> {
+    let is_name = id.len() <= REQUEST_ID_LEN_MAX && id.bytes().all(|byte| byte.is_ascii_graphic());
+    if is_name { Ok(()) } else { Err(ServiceError::invalid("request_id", "must be 1 to 64 visible ASCII characters")) }
 }
 
 fn draw_seed() -> u64 {

@@ -8,9 +8,10 @@ from __future__ import annotations
 import json
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -302,6 +303,46 @@ def test_rollouts_are_the_same_by_both_faces_alone_and_in_a_batch(address: str) 
             assert result.acts.acts == 2 * 200 / result.options.action_horizon and result.acts.replayed == 0
             assert {session.session_id for session in client.sessions()} <= before, "a rollout closes its sessions"
     assert returns["grpc alone"] == returns["http alone"] == returns["batch"]
+
+
+def test_an_episode_that_is_over_takes_no_act(client: Client) -> None:
+    """Whoever drove a session that somebody else had reset drove the new episode, and did not know."""
+    with client.open_session("tiny", seed=3) as session:
+        session.act(STATES[0])
+        other = client.attach(session.session_id)
+        other.reset(seed=4)
+        with pytest.raises(StepConflict, match="episode 0 does not run; 1 does") as conflict:
+            session.act(STATES[1])
+        assert conflict.value.reason == "EPISODE_OVER" and conflict.value.committed_step == 0
+        assert session.catch_up() == 0 and session.seed == 4
+        assert session.act(STATES[1]).step == 1
+
+
+def test_an_open_or_reset_whose_answer_was_lost_is_done_once(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    face = client._face
+    lost = {"open_session": 1, "reset_session": 1}
+
+    def losing(verb: str) -> Callable[..., Any]:
+        done = getattr(face, verb)
+
+        def call(*arguments: Any) -> Any:
+            answer = done(*arguments)
+            if lost[verb]:
+                lost[verb] -= 1
+                raise Unavailable("the answer was lost")
+            return answer
+
+        return call
+
+    for verb in lost:
+        monkeypatch.setattr(face, verb, losing(verb))
+    before = {session.session_id for session in client.sessions()}
+    with client.open_session("tiny") as session:
+        assert {other.session_id for other in client.sessions()} - before == {session.session_id}
+        session.act(STATES[0])
+        session.reset(seed=9)
+        assert session.summary().episode == 1 and session.act(STATES[0]).step == 1
+    assert not any(lost.values())
 
 
 def test_rewards_are_withheld_when_asked(address: str) -> None:

@@ -21,10 +21,11 @@ from contextlib import suppress
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar
+from uuid import uuid4
 
 from numpy.typing import ArrayLike, NDArray
 
-from ada_diffuser.errors import AdaError, InvalidInput, NotFound, StepConflict, TooLarge, Unavailable
+from ada_diffuser.errors import AdaError, InvalidInput, NotFound, TooLarge, Unavailable
 from ada_diffuser.faces import Face, connect
 from ada_diffuser.messages import (
     ActCall,
@@ -130,11 +131,12 @@ class Client:
     ) -> Session:
         """A session at committed step 0. Without `seed` the server draws one (`session.seed`).
 
-        If an answer is lost on the way, the retry opens a second session and the first one expires unused.
+        If an answer is lost on the way, the retry gets the session that the first attempt has opened.
         """
         name, wanted = _model_name(model), _options(options)
         seed, ttl_ms = _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
-        summary, spec = self._tried(lambda timeout_s: self._face.open_session(name, seed, wanted, ttl_ms, timeout_s))
+        request_id = uuid4().hex
+        summary, spec = self._tried(lambda timeout_s: self._face.open_session(name, seed, wanted, ttl_ms, request_id, timeout_s))
         return Session(self, summary, spec)
 
     def attach(self, session_id: str) -> Session:
@@ -232,12 +234,12 @@ class Client:
     def _act(self, call: ActCall) -> Chunk:
         return self._tried(lambda timeout_s: self._face.act(call, timeout_s))
 
-    def _reset(self, session_id: str, seed: int | None, keep_history: bool) -> SessionSummary:
-        seed, keep_history = _whole_if_given(seed, "seed"), flag(keep_history, "keep_history")
+    def _reset(self, session_id: str, seed: int | None, keep_history: bool, episode: int) -> SessionSummary:
+        seed, keep_history, request_id = _whole_if_given(seed, "seed"), flag(keep_history, "keep_history"), uuid4().hex
         # An act that was given up here may still be in flight there, for a moment: worth the wait.
         return self._tried(
-            lambda timeout_s: self._face.reset_session(session_id, seed, keep_history, timeout_s),
-            lambda error: error.retryable or isinstance(error, StepConflict),
+            lambda timeout_s: self._face.reset_session(session_id, seed, keep_history, request_id, episode, timeout_s),
+            lambda error: error.retryable or error.reason == "SESSION_BUSY",
         )
 
     def _close_session(self, session_id: str) -> None:
@@ -309,6 +311,7 @@ class Session:
         #: Seed of the running episode.
         self.seed = summary.seed
         self._committed_step = summary.committed_step
+        self._episode = summary.episode
         self._closed = False
 
     def __enter__(self) -> Session:
@@ -356,6 +359,7 @@ class Session:
         return ActCall(
             session_id=self.session_id,
             step=self._committed_step + 1,
+            episode=self._episode,
             state=vector(observation.state, "observation.state"),
             executed=executed_values(observation.executed),
             nothing_executed=flag(observation.nothing_executed, "observation.nothing_executed"),
@@ -374,16 +378,17 @@ class Session:
 
         With `keep_history` the latent goes on looking back on the old episode, for a context that outlasts episodes.
         """
-        summary = self._client._reset(self.session_id, seed, keep_history)
-        self.seed, self._committed_step = summary.seed, summary.committed_step
+        summary = self._client._reset(self.session_id, seed, keep_history, self._episode)
+        self.seed, self._committed_step, self._episode = summary.seed, summary.committed_step, summary.episode
 
     def summary(self) -> SessionSummary:
         """The state of the session on the server."""
         return self._client.summary(self.session_id)
 
     def catch_up(self) -> int:
-        """Takes over the server's committed step, after a `StepConflict` or `PayloadMismatch`; returns it."""
-        self._committed_step = self.summary().committed_step
+        """Takes over the server's episode and committed step, after a `StepConflict` or `PayloadMismatch`; returns the step."""
+        summary = self.summary()
+        self.seed, self._committed_step, self._episode = summary.seed, summary.committed_step, summary.episode
         return self._committed_step
 
     def close(self) -> None:

@@ -88,7 +88,7 @@ class SessionGone(NotFound):
 
 
 class StepConflict(AdaError):
-    """Somebody else moved the session: go on from `committed_step`. STEP_OUT_OF_ORDER, SESSION_BUSY."""
+    """Somebody else moved the session: go on by `session.catch_up()`. STEP_OUT_OF_ORDER, SESSION_BUSY, EPISODE_OVER."""
 
 
 class PayloadMismatch(AdaError):
@@ -141,6 +141,7 @@ _BY_REASON: dict[str, type[AdaError]] = {
     "SESSION_EVICTED": SessionGone,
     "STEP_OUT_OF_ORDER": StepConflict,
     "SESSION_BUSY": StepConflict,
+    "EPISODE_OVER": StepConflict,
     "STEP_PAYLOAD_MISMATCH": PayloadMismatch,
     "QUEUE_FULL": Overloaded,
     "QUOTA": Overloaded,

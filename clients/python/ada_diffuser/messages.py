@@ -141,6 +141,8 @@ class ActCall:
 
     session_id: str
     step: int
+    #: The episode that it belongs to: a copy that the network delivers after a reset is refused.
+    episode: int
     state: Floats
     executed: tuple[ExecutedValues, ...]
     nothing_executed: bool = False

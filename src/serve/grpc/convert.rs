@@ -9,7 +9,7 @@ use crate::{
     serve::{
         error::ServiceError,
         registry::Model,
-        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, OptionsPatch},
+        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, OptionsPatch, ResetRequest},
         session::{Answer, Summary, Timings},
     },
 };
@@ -18,8 +18,13 @@ use std::time::Duration;
 type Checked<T> = Result<T, ServiceError>;
 
 pub fn open_request(request: pb::OpenSessionRequest) -> Checked<OpenRequest> {
-    let pb::OpenSessionRequest { model, seed, options, ttl_ms } = request;
-    Ok(OpenRequest { model, seed, options: options.map_or(Ok(OptionsPatch::default()), options_patch)?, ttl_ms })
+    let pb::OpenSessionRequest { model, seed, options, ttl_ms, request_id } = request;
+    Ok(OpenRequest { model, seed, options: options.map_or(Ok(OptionsPatch::default()), options_patch)?, ttl_ms, request_id })
+}
+
+pub fn reset_request(request: pb::ResetSessionRequest) -> ResetRequest {
+    let pb::ResetSessionRequest { session_id, seed, keep_history, request_id, episode } = request;
+    ResetRequest { session_id, seed, keep_history, request_id, episode }
 }
 
 fn options_patch(options: pb::SamplerOptions) -> Checked<OptionsPatch> {
@@ -41,12 +46,12 @@ fn latent_mode(mode: i32) -> Checked<LatentMode> {
 
 /// `timeout`: the call's own.
 pub fn act_request(request: pb::ActRequest, timeout: Option<Duration>) -> Result<ActRequest, ActResult> {
-    let pb::ActRequest { session_id, step, observation, deadline_ms, want_planned_states } = request;
+    let pb::ActRequest { session_id, step, observation, deadline_ms, want_planned_states, episode } = request;
     let deadline = deadline_ms.map(|ms| Duration::from_millis(ms.into()));
     match observation {
         Some(observation) => {
             let observation = self::observation(observation);
-            Ok(ActRequest { session_id, step, observation, deadline, timeout, want_planned_states, face: Face::Grpc })
+            Ok(ActRequest { session_id, step, episode, observation, deadline, timeout, want_planned_states, face: Face::Grpc })
         }
         None => {
             let result = Err(ServiceError::invalid("observation", "is missing"));
@@ -132,6 +137,7 @@ fn error(error: &ServiceError) -> pb::Error {
         committed_step: error.committed_step(),
         retry_after_ms: error.retry_after_ms(),
         error_id: error.error_id().map(|id| id.to_string()).unwrap_or_default(),
+        episode: error.episode(),
     }
 }
 

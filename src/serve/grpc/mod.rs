@@ -143,8 +143,7 @@ impl agent_server::Agent for Face {
     }
 
     async fn reset_session(&self, request: Request<pb::ResetSessionRequest>) -> Answer<pb::ResetSessionResponse> {
-        let pb::ResetSessionRequest { session_id, seed, keep_history } = request.into_inner();
-        let session = self.0.reset(&session_id, seed, keep_history).map_err(refuse)?;
+        let session = self.0.reset(convert::reset_request(request.into_inner())).map_err(refuse)?;
         Ok(Response::new(pb::ResetSessionResponse { session: Some(convert::session(session)) }))
     }
 

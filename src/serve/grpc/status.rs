@@ -10,7 +10,7 @@ use tonic::{
 pub fn code(error: &ServiceError) -> Code {
     match error {
         ServiceError::Invalid { .. } => Code::InvalidArgument,
-        ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } => Code::Aborted,
+        ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } | ServiceError::EpisodeOver { .. } => Code::Aborted,
         ServiceError::StepPayloadMismatch { .. } => Code::FailedPrecondition,
         ServiceError::SessionNotFound
         | ServiceError::SessionExpired
@@ -35,6 +35,7 @@ pub fn status(error: &ServiceError) -> Status {
     };
     put("ada-field", error.field().map(str::to_owned));
     put("ada-committed-step", error.committed_step().map(|step| step.to_string()));
+    put("ada-episode", error.episode().map(|episode| episode.to_string()));
     put("grpc-retry-pushback-ms", error.retry_after_ms().map(|ms| ms.to_string()));
     put("ada-error-id", error.error_id().map(|id| id.to_string()));
     Status::with_metadata(code(error), error.to_string(), trailers)
@@ -52,6 +53,7 @@ mod tests {
             assert_eq!((i32::from(status.code()), trailer("ada-reason").as_deref()), (grpc, Some(reason)), "{error:?}");
             assert_eq!(trailer("ada-field").as_deref(), error.field(), "{error:?}");
             assert_eq!(trailer("ada-committed-step"), error.committed_step().map(|_| "3".to_owned()), "{error:?}");
+            assert_eq!(trailer("ada-episode"), error.episode().map(|_| "2".to_owned()), "{error:?}");
             assert_eq!(trailer("grpc-retry-pushback-ms"), error.retry_after_ms().map(|_| "1500".to_owned()), "{error:?}");
             assert_eq!(trailer("ada-error-id").is_some(), grpc == 13, "{error:?}");
         }

@@ -2,7 +2,7 @@
 
 use crate::{
     model::agent::{Executed, LatentMode, Observation, SamplerOptions},
-    serve::request::{ActRequest, Face, OpenRequest, OptionsPatch},
+    serve::request::{ActRequest, Face, OpenRequest, OptionsPatch, ResetRequest},
 };
 use serde::{Deserialize, Deserializer, Serialize, de};
 use std::time::Duration;
@@ -20,6 +20,8 @@ pub struct OpenBody {
     options: Option<OptionsBody>,
     /// Idle time to live.
     ttl_ms: Option<u64>,
+    /// The client's name for this request: while the session lives, the same again gives the same session.
+    request_id: Option<String>,
 }
 
 /// How a chunk is sampled; absent: as the model has it.
@@ -93,6 +95,8 @@ pub struct ActBody {
     deadline_ms: Option<u32>,
     /// Whether the answer holds `planned_states`.
     want_planned_states: Option<bool>,
+    /// The episode that it belongs to; absent: the running one.
+    episode: Option<u64>,
 }
 
 /// What the client saw since its last act, in the units of the data set.
@@ -133,9 +137,21 @@ pub struct BatchBody {
 #[serde(deny_unknown_fields, default)]
 pub struct ResetBody {
     /// Seed of the new episode; absent: drawn.
-    pub seed: Option<u64>,
+    seed: Option<u64>,
     /// Whether the latent goes on looking back on the old episode.
-    pub keep_history: Option<bool>,
+    keep_history: Option<bool>,
+    /// The client's name for this request: the same again resets nothing.
+    request_id: Option<String>,
+    /// The episode that it ends; absent: the running one.
+    episode: Option<u64>,
+}
+
+impl ResetBody {
+    /// The reset of this session.
+    pub fn into_request(self, session_id: String) -> ResetRequest {
+        let Self { seed, keep_history, request_id, episode } = self;
+        ResetRequest { session_id, seed, keep_history: keep_history.unwrap_or(false), request_id: request_id.unwrap_or_default(), episode }
+    }
 }
 
 /// ListSessions.
@@ -153,23 +169,24 @@ pub struct ListQuery {
 
 impl From<OpenBody> for OpenRequest {
     fn from(body: OpenBody) -> Self {
-        let OpenBody { model, seed, options, ttl_ms } = body;
+        let OpenBody { model, seed, options, ttl_ms, request_id } = body;
         let OptionsBody { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = options.unwrap_or_default();
         let kappa = kappa.map(f32::from);
         let options = OptionsPatch { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent };
-        Self { model: model.unwrap_or_default(), seed, options, ttl_ms }
+        Self { model: model.unwrap_or_default(), seed, options, ttl_ms, request_id: request_id.unwrap_or_default() }
     }
 }
 
 impl ActBody {
     /// The act of this session.
     pub fn into_request(self, session_id: String) -> ActRequest {
-        let Self { session_id: _, step, observation, deadline_ms, want_planned_states } = self;
+        let Self { session_id: _, step, observation, deadline_ms, want_planned_states, episode } = self;
         let ObservationBody { state, executed, nothing_executed } = observation;
         let step_of = |ExecutedBody { state, action, reward }| Executed { state, action, reward };
         ActRequest {
             session_id,
             step,
+            episode,
             observation: Observation {
                 state,
                 executed: executed.unwrap_or_default().into_iter().map(step_of).collect(),

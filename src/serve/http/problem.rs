@@ -33,6 +33,9 @@ pub struct Problem {
     /// Where the session stands.
     #[serde(skip_serializing_if = "Option::is_none")]
     committed_step: Option<u64>,
+    /// The episode that runs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    episode: Option<u64>,
     /// Try the same again after this time.
     #[serde(skip_serializing_if = "Option::is_none")]
     retry_after_ms: Option<u64>,
@@ -45,7 +48,7 @@ pub struct Problem {
 pub fn status(error: &ServiceError) -> StatusCode {
     match error {
         ServiceError::Invalid { .. } => StatusCode::BAD_REQUEST,
-        ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } => StatusCode::CONFLICT,
+        ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } | ServiceError::EpisodeOver { .. } => StatusCode::CONFLICT,
         ServiceError::StepPayloadMismatch { .. } => StatusCode::UNPROCESSABLE_ENTITY,
         ServiceError::SessionNotFound | ServiceError::ModelNotFound { .. } => StatusCode::NOT_FOUND,
         ServiceError::SessionExpired | ServiceError::SessionEvicted => StatusCode::GONE,
@@ -70,6 +73,7 @@ impl Problem {
             detail: detail.to_owned(),
             field: None,
             committed_step: None,
+            episode: None,
             retry_after_ms: None,
             error_id: None,
         }
@@ -81,6 +85,7 @@ impl From<&ServiceError> for Problem {
         Self {
             field: error.field().map(str::to_owned),
             committed_step: error.committed_step(),
+            episode: error.episode(),
             retry_after_ms: error.retry_after_ms(),
             error_id: error.error_id().map(|id| id.to_string()),
             ..Self::new(status(error), error.reason(), &error.to_string())
@@ -128,6 +133,7 @@ mod tests {
             assert_eq!((problem["status"].as_u64(), problem["reason"].as_str()), (Some(http.into()), Some(reason)), "{error:?}");
             assert_eq!(problem["field"].as_str(), error.field(), "{error:?}");
             assert_eq!(problem["committed_step"].as_u64(), error.committed_step(), "{error:?}");
+            assert_eq!(problem["episode"].as_u64(), error.episode(), "{error:?}");
             assert_eq!(problem.get("error_id").is_some(), http == 500, "{error:?}");
             let response = Problem::from(&error).into_response();
             assert_eq!(response.status().as_u16(), http);

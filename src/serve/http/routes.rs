@@ -157,8 +157,8 @@ async fn close_session(Shared(state): Shared<State>, Named(id): Named) -> Result
 async fn reset_session(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Answer<OneSession> {
     let config = state.service.config();
     let bytes = bytes(body, config).await?;
-    let ResetBody { seed, keep_history } = if bytes.is_empty() { ResetBody::default() } else { parse(&bytes, config)? };
-    let session = state.service.reset(&id, seed, keep_history.unwrap_or(false))?;
+    let body: ResetBody = if bytes.is_empty() { ResetBody::default() } else { parse(&bytes, config)? };
+    let session = state.service.reset(body.into_request(id))?;
     Ok(Json(OneSession { session: session.into() }))
 }
 

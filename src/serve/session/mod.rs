@@ -13,6 +13,7 @@ use crate::{
 use parking_lot::Mutex;
 use sha2::{Digest, Sha256};
 use std::{
+    collections::VecDeque,
     sync::{
         Arc,
         atomic::{AtomicUsize, Ordering},
@@ -20,6 +21,9 @@ use std::{
     time::{Duration, Instant},
 };
 use uuid::Uuid;
+
+/// Resets of a session that are known by name.
+const RESET_IDS_MAX: usize = 16;
 
 /// SHA-256 of an observation: what "the same observation" means for a repeated step.
 pub type Key = [u8; 32];
@@ -69,6 +73,8 @@ pub struct Opening {
     pub options: SamplerOptions,
     /// Idle time to live.
     pub ttl: Duration,
+    /// The client's name for the request; empty: none.
+    pub request_id: String,
 }
 
 /// One session. Its slot is locked for moments only, never while a model runs or across an await.
@@ -81,6 +87,8 @@ pub struct Session {
     pub agent: Arc<Agent>,
     /// Sampling options of all its episodes.
     pub options: SamplerOptions,
+    /// Name of the request that opened it; empty: none.
+    request_id: String,
     ttl: Duration,
     opened: Instant,
     /// Memory of all sessions of the table, kept up to date by each.
@@ -90,8 +98,10 @@ pub struct Session {
 
 struct Slot {
     touched: Instant,
-    /// How often the session was reset.
+    /// How often the session was reset: the number of the running episode.
     resets: u64,
+    /// Names of the last requests that reset it.
+    reset_ids: VecDeque<String>,
     committed: Committed,
     flight: Option<Arc<Flight>>,
     ended: bool,
@@ -153,22 +163,31 @@ pub struct Summary {
 
 impl Session {
     fn new(opening: Opening, bytes_total: Arc<AtomicUsize>, now: Instant) -> Self {
-        let Opening { model, agent, episode, options, ttl } = opening;
+        let Opening { model, agent, episode, options, ttl, request_id } = opening;
         bytes_total.fetch_add(episode.size_bytes(), Ordering::Relaxed);
-        let slot = Slot { touched: now, resets: 0, committed: Committed::fresh(episode), flight: None, ended: false };
-        Self { id: Uuid::new_v4(), model, agent, options, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
+        let slot =
+            Slot { touched: now, resets: 0, reset_ids: VecDeque::new(), committed: Committed::fresh(episode), flight: None, ended: false };
+        Self { id: Uuid::new_v4(), model, agent, options, request_id, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
     }
 
-    /// Takes up a step: replays, joins or leads it; after `due` the caller prefers a coarser answer to a later one.
+    /// Takes up a step, of this episode if one is named: replays, joins or leads it; after `due` the caller prefers a coarser answer to a later
+    /// one.
     ///
     /// # Errors
-    /// If the step is out of order, busy, or known with another observation, or if the session has ended.
-    pub fn enter(self: &Arc<Self>, step: u64, key: Key, now: Instant, due: Option<Instant>) -> Result<Entry, ServiceError> {
+    /// If the episode is over, the step out of order, busy, or known with another observation, or if the session has ended.
+    pub fn enter(
+        self: &Arc<Self>,
+        (episode, step): (Option<u64>, u64),
+        key: Key,
+        now: Instant,
+        due: Option<Instant>,
+    ) -> Result<Entry, ServiceError> {
         let mut slot = self.slot.lock();
         if slot.ended {
             return Err(ServiceError::SessionNotFound);
         }
         slot.touched = now;
+        slot.check_episode(episode)?;
         let committed = slot.committed.step;
         if step == committed
             && let Some((last_key, answer)) = &slot.committed.last
@@ -217,15 +236,27 @@ impl Session {
         flight.settle(Err(error));
     }
 
-    /// A new episode, made from the old one.
+    /// A new episode, made from the old one, which is this one if one is named. A named request that has reset the session already does not
+    /// do so again: a copy that came late once undid 24 committed acts.
     ///
     /// # Errors
-    /// While an act is in flight, or after the end.
-    pub fn reset(&self, renew: impl FnOnce(&Episode) -> Episode, now: Instant) -> Result<(), ServiceError> {
+    /// If the episode is over, while an act is in flight, or after the end.
+    pub fn reset(
+        &self,
+        renew: impl FnOnce(&Episode) -> Episode,
+        ends: Option<u64>,
+        request_id: String,
+        now: Instant,
+    ) -> Result<(), ServiceError> {
         let mut slot = self.slot.lock();
         if slot.ended {
             return Err(ServiceError::SessionNotFound);
         }
+        if slot.reset_ids.contains(&request_id) {
+            slot.touched = now;
+            return Ok(());
+        }
+        slot.check_episode(ends)?;
         if slot.flight.as_ref().is_some_and(|flight| flight.is_wanted()) {
             return Err(ServiceError::SessionBusy { committed: slot.committed.step });
         }
@@ -233,6 +264,7 @@ impl Session {
         self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
         slot.flight = None;
         slot.resets += 1;
+        slot.remember(request_id);
         slot.touched = now;
         slot.committed = Committed::fresh(episode);
         Ok(())
@@ -305,6 +337,25 @@ impl Session {
 }
 
 impl Slot {
+    fn check_episode(&self, named: Option<u64>) -> Result<(), ServiceError> {
+        match named {
+            Some(episode) if episode != self.resets => {
+                Err(ServiceError::EpisodeOver { episode, running: self.resets, committed: self.committed.step })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn remember(&mut self, reset_id: String) {
+        if reset_id.is_empty() {
+            return;
+        }
+        if self.reset_ids.len() >= RESET_IDS_MAX {
+            self.reset_ids.pop_front();
+        }
+        self.reset_ids.push_back(reset_id);
+    }
+
     /// Frees the place of this flight; says whether it still held it.
     fn release(&mut self, flight: &Arc<Flight>) -> bool {
         let held = self.flight.as_ref().is_some_and(|current| Arc::ptr_eq(current, flight));

@@ -7,7 +7,8 @@ use crate::serve::{
 };
 use parking_lot::Mutex;
 use std::{
-    collections::{HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    ops::Bound,
     sync::{
         Arc,
         atomic::{AtomicUsize, Ordering},
@@ -17,6 +18,8 @@ use std::{
 use uuid::Uuid;
 
 const SHARDS: usize = 16;
+/// Sessions that one eviction looks at: a refusal must not cost more than an act.
+const LOOKS_MAX: usize = 64;
 
 /// How a session ended without its client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,9 +44,12 @@ impl Ending {
     }
 }
 
-/// The table. Locks are taken in the order shard, slot, and held for moments.
+/// The table. Locks are taken in the order shard, slot; those of `idle` and `opened` come last, and hold nothing else. All are held for moments.
 pub struct Sessions {
     shards: [Mutex<Shard>; SHARDS],
+    idle: Mutex<Idle>,
+    /// Live sessions by the name of the request that opened them.
+    opened: Mutex<HashMap<String, Uuid>>,
     len: AtomicUsize,
     bytes: Arc<AtomicUsize>,
     config: SessionsConfig,
@@ -51,16 +57,50 @@ pub struct Sessions {
 
 #[derive(Default)]
 struct Shard {
-    live: HashMap<Uuid, Arc<Session>>,
+    live: BTreeMap<Uuid, Arc<Session>>,
     ended: HashMap<Uuid, Ending>,
     /// The same, oldest first.
     endings: VecDeque<(Instant, Uuid)>,
 }
 
+/// Live sessions by a time since which each may have been idle: not later than its last touch, so that an act need not come here. The first
+/// one is looked at before it is evicted, and filed anew if it was touched since.
+#[derive(Default)]
+struct Idle {
+    order: BTreeSet<(Instant, Uuid)>,
+    filed: HashMap<Uuid, Instant>,
+}
+
+impl Idle {
+    fn file(&mut self, id: Uuid, since: Instant) {
+        self.forget(id);
+        self.filed.insert(id, since);
+        self.order.insert((since, id));
+    }
+
+    fn forget(&mut self, id: Uuid) {
+        if let Some(since) = self.filed.remove(&id) {
+            self.order.remove(&(since, id));
+        }
+    }
+
+    /// The one that may have been idle for longest, if it may have been for so long.
+    fn first(&self, idle_min: Duration, now: Instant) -> Option<(Instant, Uuid)> {
+        self.order.first().filter(|(since, _)| now.saturating_duration_since(*since) >= idle_min).copied()
+    }
+}
+
 impl Sessions {
     /// An empty table.
     pub fn new(config: SessionsConfig) -> Self {
-        Self { shards: Default::default(), len: AtomicUsize::new(0), bytes: Arc::default(), config }
+        Self {
+            shards: Default::default(),
+            idle: Mutex::default(),
+            opened: Mutex::default(),
+            len: AtomicUsize::new(0),
+            bytes: Arc::default(),
+            config,
+        }
     }
 
     /// Live sessions.
@@ -78,11 +118,34 @@ impl Sessions {
         self.bytes.load(Ordering::Relaxed)
     }
 
-    /// Adds a session, evicting an idle one where there is no room.
+    /// Adds a session, evicting an idle one where there is no room; or gives that which a request of this name has opened.
     ///
     /// # Errors
-    /// `Quota` if there is no room and nobody idle for long enough.
+    /// `Quota` if there is no room and nobody idle for long enough; `Invalid` if the name opened a session of another model.
     pub fn open(&self, opening: Opening, now: Instant) -> Result<Arc<Session>, ServiceError> {
+        let (name, model) = (opening.request_id.clone(), opening.model.clone());
+        if name.is_empty() {
+            return self.add(opening, now);
+        }
+        if let Some(session) = self.opened(&name, now) {
+            return same_model(session, &model);
+        }
+        let session = self.add(opening, now)?;
+        // Of two that came at the same time the first one's session is that of both.
+        let first = *self.opened.lock().entry(name).or_insert(session.id);
+        if first == session.id {
+            return Ok(session);
+        }
+        self.close(session.id, now)?;
+        same_model(self.get(first, now)?, &model)
+    }
+
+    fn opened(&self, name: &str, now: Instant) -> Option<Arc<Session>> {
+        let id = *self.opened.lock().get(name)?;
+        self.get(id, now).ok()
+    }
+
+    fn add(&self, opening: Opening, now: Instant) -> Result<Arc<Session>, ServiceError> {
         while self.bytes() + opening.episode.size_bytes() > self.config.bytes_max {
             self.evict(now)?;
         }
@@ -92,6 +155,7 @@ impl Sessions {
         }
         let session = Arc::new(Session::new(opening, self.bytes.clone(), now));
         self.shard(session.id).lock().live.insert(session.id, session.clone());
+        self.idle.lock().file(session.id, now);
         metrics::counter!("ada_sessions_created_total").increment(1);
         Ok(session)
     }
@@ -122,7 +186,7 @@ impl Sessions {
         if self.shard(id).lock().live.remove(&id).is_none() {
             return Err(ServiceError::SessionNotFound);
         }
-        self.len.fetch_sub(1, Ordering::Relaxed);
+        self.forget(&session);
         session.end();
         metrics::counter!("ada_sessions_ended_total", "reason" => "closed").increment(1);
         Ok(())
@@ -130,11 +194,12 @@ impl Sessions {
 
     /// Up to `len` sessions with ids above `after`, in order of id.
     pub fn page(&self, after: Option<Uuid>, model: Option<&str>, len: usize) -> Vec<Arc<Session>> {
-        let wanted =
-            |session: &&Arc<Session>| after.is_none_or(|after| session.id > after) && model.is_none_or(|model| *session.model == *model);
+        let behind = after.map_or(Bound::Unbounded, Bound::Excluded);
         let mut found: Vec<_> = Vec::new();
         for shard in &self.shards {
-            found.extend(shard.lock().live.values().filter(wanted).cloned());
+            let shard = shard.lock();
+            let sessions = shard.live.range((behind, Bound::Unbounded)).map(|(_, session)| session);
+            found.extend(sessions.filter(|session| model.is_none_or(|model| *session.model == *model)).take(len).cloned());
         }
         found.sort_unstable_by_key(|session| session.id);
         found.truncate(len);
@@ -157,36 +222,43 @@ impl Sessions {
         metrics::gauge!("ada_session_state_bytes").set(self.bytes() as f64);
     }
 
-    /// Evicts the session that is idle for longest.
+    /// Evicts the session that is idle for longest. Whether it finds one or not, it looks at a few sessions only.
     fn evict(&self, now: Instant) -> Result<(), ServiceError> {
         let idle_min = Duration::from_millis(self.config.evict_idle_ms);
-        // A candidate may become busy between look and grasp: then look again, but not for ever.
-        for _ in 0..4 {
-            let Some((_, id)) = self.longest_idle() else { break };
+        for _ in 0..LOOKS_MAX {
+            let Some((filed, id)) = self.idle.lock().first(idle_min, now) else { break };
             let mut shard = self.shard(id).lock();
-            let Some(session) = shard.live.get(&id) else { continue };
-            if session.end_if_idle(idle_min, now) {
+            let Some(session) = shard.live.get(&id).cloned() else {
+                self.idle.lock().forget(id);
+                continue;
+            };
+            let since = session.idle_since().unwrap_or(now);
+            if since == filed && session.end_if_idle(idle_min, now) {
                 self.bury(&mut shard, id, Ending::Evicted, now);
                 return Ok(());
             }
+            // Touched since: another one may have been idle for longer.
+            self.idle.lock().file(id, since);
         }
         metrics::counter!("ada_shed_total", "reason" => "QUOTA").increment(1);
         Err(ServiceError::Quota { retry_after_ms: self.config.reap_interval_ms })
     }
 
-    fn longest_idle(&self) -> Option<(Instant, Uuid)> {
-        let oldest = |shard: &Mutex<Shard>| {
-            let shard = shard.lock();
-            shard.live.values().filter_map(|session| Some((session.idle_since()?, session.id))).min()
-        };
-        self.shards.iter().filter_map(oldest).min()
+    /// What is known of a session beside its shard.
+    fn forget(&self, session: &Session) {
+        self.len.fetch_sub(1, Ordering::Relaxed);
+        self.idle.lock().forget(session.id);
+        if !session.request_id.is_empty() {
+            let mut opened = self.opened.lock();
+            if opened.get(&session.request_id) == Some(&session.id) {
+                opened.remove(&session.request_id);
+            }
+        }
     }
 
     fn bury(&self, shard: &mut Shard, id: Uuid, ending: Ending, now: Instant) {
-        if shard.live.remove(&id).is_none() {
-            return;
-        }
-        self.len.fetch_sub(1, Ordering::Relaxed);
+        let Some(session) = shard.live.remove(&id) else { return };
+        self.forget(&session);
         metrics::counter!("ada_sessions_ended_total", "reason" => ending.word()).increment(1);
         shard.ended.insert(id, ending);
         shard.endings.push_back((now, id));
@@ -200,6 +272,11 @@ impl Sessions {
     }
 }
 
+fn same_model(session: Arc<Session>, model: &str) -> Result<Arc<Session>, ServiceError> {
+    let other = || ServiceError::invalid("request_id", format!("has opened a session of {}: a name stands for one request", session.model));
+    if *session.model == *model { Ok(session) } else { Err(other()) }
+}
+
 impl Shard {
     fn forget(&mut self, ttl: Duration, now: Instant) {
         while self.endings.front().is_some_and(|(at, _)| now.saturating_duration_since(*at) >= ttl) {
@@ -211,5 +288,62 @@ impl Shard {
         if let Some((_, id)) = self.endings.pop_front() {
             self.ended.remove(&id);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::checkpoint;
+    use std::path::Path;
+
+    const MINUTE: Duration = Duration::from_secs(60);
+
+    fn table(len_max: usize) -> (Sessions, impl Fn() -> Opening) {
+        let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
+        let opening = move || {
+            let (options, ttl) = (agent.config().sampler.clone(), 60 * MINUTE);
+            let episode = agent.open(1, &options).unwrap();
+            Opening { model: "tiny".into(), agent: agent.clone(), episode, options, ttl, request_id: String::new() }
+        };
+        (Sessions::new(SessionsConfig { len_max, evict_idle_ms: 60_000, ..SessionsConfig::default() }), opening)
+    }
+
+    #[test]
+    fn the_longest_idle_gives_its_place() {
+        let (sessions, opening) = table(3);
+        let begin = Instant::now();
+        let ids = [0, 1, 2].map(|minute| sessions.open(opening(), begin + minute * MINUTE).unwrap().id);
+        sessions.get(ids[0], begin + 3 * MINUTE).unwrap();
+        sessions.open(opening(), begin + 4 * MINUTE).unwrap();
+        let ended = ids.map(|id| sessions.get(id, begin + 4 * MINUTE).err());
+        assert_eq!(ended, [None, Some(ServiceError::SessionEvicted), None]);
+        sessions.close(ids[2], begin + 4 * MINUTE).unwrap();
+        assert_eq!((sessions.len(), sessions.idle.lock().order.len()), (2, 2), "who has left is forgotten");
+    }
+
+    /// A refusal scanned all sessions, up to four times: 433 a second made good acts wait 226 ms. It looks at a few, and finds the idle one
+    /// among many that are not in a few tries.
+    #[test]
+    fn a_refusal_looks_at_a_few() {
+        let (sessions, opening) = table(201);
+        let begin = Instant::now();
+        let ids: Vec<Uuid> = (0..201).map(|_| sessions.open(opening(), begin).unwrap().id).collect();
+        let mut order: Vec<Uuid> = ids.clone();
+        order.sort();
+        // The last that will be looked at is the only idle one.
+        let (idle, hot) = order.split_last().unwrap();
+        for id in hot {
+            sessions.get(*id, begin + MINUTE).unwrap();
+        }
+        let now = begin + MINUTE + MINUTE / 2;
+        let mut refused = 0;
+        while sessions.open(opening(), now).is_err() {
+            refused += 1;
+        }
+        assert_eq!(refused, 200 / LOOKS_MAX);
+        assert_eq!(sessions.get(*idle, now).err(), Some(ServiceError::SessionEvicted));
+        assert!(sessions.open(opening(), now).is_err());
+        assert!(sessions.idle.lock().first(MINUTE, now).is_none(), "and then none is looked at");
     }
 }

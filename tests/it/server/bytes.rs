@@ -22,7 +22,7 @@ fn observation(seed: usize, step: u64) -> pb::Observation {
 
 fn request(id: &str, seed: usize, step: u64) -> pb::ActRequest {
     let observation = Some(observation(seed, step));
-    pb::ActRequest { session_id: id.to_owned(), step, observation, want_planned_states: true, deadline_ms: None }
+    pb::ActRequest { session_id: id.to_owned(), step, observation, want_planned_states: true, ..Default::default() }
 }
 
 fn request_json(id: &str, seed: usize, step: u64) -> Value {

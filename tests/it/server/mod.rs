@@ -5,6 +5,7 @@ mod ends;
 mod engine;
 mod errors;
 mod generator;
+mod late;
 mod lifecycle;
 mod limits;
 mod steps;

@@ -178,7 +178,7 @@ async fn a_reset_begins_again() {
     assert_eq!((&again["actions"], &again["replayed"]), (&first["actions"], &json!(false)));
     let drawn = server.http("POST", &format!("/v1/sessions/{id}/reset"), "").await.json()["session"]["seed"].as_u64().unwrap();
     assert!(drawn != 11 && drawn < 1 << 53);
-    let reset = pb::ResetSessionRequest { session_id: id.clone(), seed: Some(11), keep_history: true };
+    let reset = pb::ResetSessionRequest { session_id: id.clone(), seed: Some(11), keep_history: true, ..Default::default() };
     let kept = server.agent().await.reset_session(reset).await.unwrap().into_inner().session.unwrap();
     assert_eq!((kept.committed_step, kept.episode, kept.seed), (0, 3, 11));
     let slow = server.open(json!({"model": "slow"})).await;

@@ -42,9 +42,9 @@ class GrpcFace:
         self._models = models_pb2_grpc.ModelsStub(self._channel)  # type: ignore[no-untyped-call]
 
     def open_session(
-        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, timeout_s: float
+        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, request_id: str, timeout_s: float
     ) -> tuple[SessionSummary, Model]:
-        request = agent_pb2.OpenSessionRequest(model=model, seed=seed, options=_options_out(options), ttl_ms=ttl_ms)
+        request = agent_pb2.OpenSessionRequest(model=model, seed=seed, options=_options_out(options), ttl_ms=ttl_ms, request_id=request_id)
         answer = self._call(self._agent.OpenSession, request, timeout_s)
         return _summary(answer.session), _model(answer.model)
 
@@ -55,8 +55,12 @@ class GrpcFace:
         request = agent_pb2.ActBatchRequest(acts=[_act_request(call) for call in calls])
         return [_result(result) for result in self._call(self._agent.ActBatch, request, timeout_s).results]
 
-    def reset_session(self, session_id: str, seed: int | None, keep_history: bool, timeout_s: float) -> SessionSummary:
-        request = agent_pb2.ResetSessionRequest(session_id=session_id, seed=seed, keep_history=keep_history)
+    def reset_session(
+        self, session_id: str, seed: int | None, keep_history: bool, request_id: str, episode: int, timeout_s: float
+    ) -> SessionSummary:
+        request = agent_pb2.ResetSessionRequest(
+            session_id=session_id, seed=seed, keep_history=keep_history, request_id=request_id, episode=episode
+        )
         return _summary(self._call(self._agent.ResetSession, request, timeout_s).session)
 
     def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:
@@ -123,7 +127,9 @@ def _error_of_result(error: agent_pb2.Error) -> AdaError:
 
 
 def _act_request(call: ActCall) -> agent_pb2.ActRequest:
-    request = agent_pb2.ActRequest(session_id=call.session_id, step=call.step, want_planned_states=call.want_planned_states)
+    request = agent_pb2.ActRequest(
+        session_id=call.session_id, step=call.step, episode=call.episode, want_planned_states=call.want_planned_states
+    )
     if call.deadline_ms is not None:
         request.deadline_ms = call.deadline_ms
     request.observation.state.extend(call.state.tolist())

@@ -33,9 +33,10 @@ class HttpFace:
         self._lock = threading.Lock()
 
     def open_session(
-        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, timeout_s: float
+        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, request_id: str, timeout_s: float
     ) -> tuple[SessionSummary, Model]:
-        body = _without_none(model=model or None, seed=seed, options=_options_out(options) or None, ttl_ms=ttl_ms)
+        options_out = _options_out(options) or None
+        body = _without_none(model=model or None, seed=seed, options=options_out, ttl_ms=ttl_ms, request_id=request_id)
         answer = self._call("POST", "/v1/sessions", body, timeout_s)
         return _read(_summary, answer, "session"), _read(_model, answer, "model")
 
@@ -47,9 +48,12 @@ class HttpFace:
         body = {"acts": [{"session_id": call.session_id, **_act_body(call)} for call in calls]}
         return _read(_results, self._call("POST", "/v1/act:batch", body, timeout_s), "results")
 
-    def reset_session(self, session_id: str, seed: int | None, keep_history: bool, timeout_s: float) -> SessionSummary:
+    def reset_session(
+        self, session_id: str, seed: int | None, keep_history: bool, request_id: str, episode: int, timeout_s: float
+    ) -> SessionSummary:
         path = f"/v1/sessions/{_quoted(session_id)}/reset"
-        return _read(_summary, self._call("POST", path, _without_none(seed=seed, keep_history=keep_history or None), timeout_s), "session")
+        body = _without_none(seed=seed, keep_history=keep_history or None, request_id=request_id, episode=episode)
+        return _read(_summary, self._call("POST", path, body, timeout_s), "session")
 
     def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:
         return _read(_summary, self._call("GET", f"/v1/sessions/{_quoted(session_id)}", None, timeout_s), "session")
@@ -216,6 +220,7 @@ def _act_body(call: ActCall) -> dict[str, Any]:
     ]
     return _without_none(
         step=call.step,
+        episode=call.episode,
         observation=_without_none(state=call.state.tolist(), executed=executed, nothing_executed=call.nothing_executed or None),
         deadline_ms=call.deadline_ms,
         want_planned_states=call.want_planned_states or None,

@@ -20,16 +20,18 @@ START_WARM: Start
 START_RENOISED: Start
 
 class OpenSessionRequest(_message.Message):
-    __slots__ = ("model", "seed", "options", "ttl_ms")
+    __slots__ = ("model", "seed", "options", "ttl_ms", "request_id")
     MODEL_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     TTL_MS_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     model: str
     seed: int
     options: _models_pb2.SamplerOptions
     ttl_ms: int
-    def __init__(self, model: _Optional[str] = ..., seed: _Optional[int] = ..., options: _Optional[_Union[_models_pb2.SamplerOptions, _Mapping]] = ..., ttl_ms: _Optional[int] = ...) -> None: ...
+    request_id: str
+    def __init__(self, model: _Optional[str] = ..., seed: _Optional[int] = ..., options: _Optional[_Union[_models_pb2.SamplerOptions, _Mapping]] = ..., ttl_ms: _Optional[int] = ..., request_id: _Optional[str] = ...) -> None: ...
 
 class OpenSessionResponse(_message.Message):
     __slots__ = ("session", "model")
@@ -40,18 +42,20 @@ class OpenSessionResponse(_message.Message):
     def __init__(self, session: _Optional[_Union[Session, _Mapping]] = ..., model: _Optional[_Union[_models_pb2.Model, _Mapping]] = ...) -> None: ...
 
 class ActRequest(_message.Message):
-    __slots__ = ("session_id", "step", "observation", "deadline_ms", "want_planned_states")
+    __slots__ = ("session_id", "step", "observation", "deadline_ms", "want_planned_states", "episode")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     OBSERVATION_FIELD_NUMBER: _ClassVar[int]
     DEADLINE_MS_FIELD_NUMBER: _ClassVar[int]
     WANT_PLANNED_STATES_FIELD_NUMBER: _ClassVar[int]
+    EPISODE_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     step: int
     observation: Observation
     deadline_ms: int
     want_planned_states: bool
-    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., observation: _Optional[_Union[Observation, _Mapping]] = ..., deadline_ms: _Optional[int] = ..., want_planned_states: bool = ...) -> None: ...
+    episode: int
+    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., observation: _Optional[_Union[Observation, _Mapping]] = ..., deadline_ms: _Optional[int] = ..., want_planned_states: bool = ..., episode: _Optional[int] = ...) -> None: ...
 
 class Observation(_message.Message):
     __slots__ = ("state", "executed", "nothing_executed")
@@ -148,7 +152,7 @@ class ActResult(_message.Message):
     def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., response: _Optional[_Union[ActResponse, _Mapping]] = ..., error: _Optional[_Union[Error, _Mapping]] = ...) -> None: ...
 
 class Error(_message.Message):
-    __slots__ = ("code", "reason", "message", "field", "committed_step", "retry_after_ms", "error_id")
+    __slots__ = ("code", "reason", "message", "field", "committed_step", "retry_after_ms", "error_id", "episode")
     CODE_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
@@ -156,6 +160,7 @@ class Error(_message.Message):
     COMMITTED_STEP_FIELD_NUMBER: _ClassVar[int]
     RETRY_AFTER_MS_FIELD_NUMBER: _ClassVar[int]
     ERROR_ID_FIELD_NUMBER: _ClassVar[int]
+    EPISODE_FIELD_NUMBER: _ClassVar[int]
     code: int
     reason: str
     message: str
@@ -163,7 +168,8 @@ class Error(_message.Message):
     committed_step: int
     retry_after_ms: int
     error_id: str
-    def __init__(self, code: _Optional[int] = ..., reason: _Optional[str] = ..., message: _Optional[str] = ..., field: _Optional[str] = ..., committed_step: _Optional[int] = ..., retry_after_ms: _Optional[int] = ..., error_id: _Optional[str] = ...) -> None: ...
+    episode: int
+    def __init__(self, code: _Optional[int] = ..., reason: _Optional[str] = ..., message: _Optional[str] = ..., field: _Optional[str] = ..., committed_step: _Optional[int] = ..., retry_after_ms: _Optional[int] = ..., error_id: _Optional[str] = ..., episode: _Optional[int] = ...) -> None: ...
 
 class ActBatchRequest(_message.Message):
     __slots__ = ("acts",)
@@ -178,14 +184,18 @@ class ActBatchResponse(_message.Message):
     def __init__(self, results: _Optional[_Iterable[_Union[ActResult, _Mapping]]] = ...) -> None: ...
 
 class ResetSessionRequest(_message.Message):
-    __slots__ = ("session_id", "seed", "keep_history")
+    __slots__ = ("session_id", "seed", "keep_history", "request_id", "episode")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
     KEEP_HISTORY_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
+    EPISODE_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     seed: int
     keep_history: bool
-    def __init__(self, session_id: _Optional[str] = ..., seed: _Optional[int] = ..., keep_history: bool = ...) -> None: ...
+    request_id: str
+    episode: int
+    def __init__(self, session_id: _Optional[str] = ..., seed: _Optional[int] = ..., keep_history: bool = ..., request_id: _Optional[str] = ..., episode: _Optional[int] = ...) -> None: ...
 
 class ResetSessionResponse(_message.Message):
     __slots__ = ("session",)

@@ -31,9 +31,12 @@ class AgentStub(object):
     The step protocol. A session counts its acts. The client sends `step = committed_step + 1`; the answer commits it. Sending the committed step again
     with the same observation gives the same bytes again with `replayed = true` and spends no network evaluation, so a client may retry whenever it is in
     doubt; while the first one still runs, the second waits for its answer. An act that fails, is cancelled or runs out of time changes nothing.
+    A network may deliver a copy late. A client that says to which `episode` an act or a reset belongs is refused (EPISODE_OVER) what comes after the
+    next reset, and one that gives each open and reset a `request_id` of its own may send them again without opening or resetting twice.
 
     Errors carry, besides code and message, these trailers: `ada-reason` (a fixed word such as STEP_OUT_OF_ORDER), and where they mean something `ada-field`
-    (path of the offending field), `ada-committed-step`, `ada-error-id` (to find an internal error in the server's log) and `grpc-retry-pushback-ms`.
+    (path of the offending field), `ada-committed-step`, `ada-episode`, `ada-error-id` (to find an internal error in the server's log) and
+    `grpc-retry-pushback-ms`.
     """
 
     def __init__(self, channel):
@@ -90,9 +93,12 @@ class AgentServicer(object):
     The step protocol. A session counts its acts. The client sends `step = committed_step + 1`; the answer commits it. Sending the committed step again
     with the same observation gives the same bytes again with `replayed = true` and spends no network evaluation, so a client may retry whenever it is in
     doubt; while the first one still runs, the second waits for its answer. An act that fails, is cancelled or runs out of time changes nothing.
+    A network may deliver a copy late. A client that says to which `episode` an act or a reset belongs is refused (EPISODE_OVER) what comes after the
+    next reset, and one that gives each open and reset a `request_id` of its own may send them again without opening or resetting twice.
 
     Errors carry, besides code and message, these trailers: `ada-reason` (a fixed word such as STEP_OUT_OF_ORDER), and where they mean something `ada-field`
-    (path of the offending field), `ada-committed-step`, `ada-error-id` (to find an internal error in the server's log) and `grpc-retry-pushback-ms`.
+    (path of the offending field), `ada-committed-step`, `ada-episode`, `ada-error-id` (to find an internal error in the server's log) and
+    `grpc-retry-pushback-ms`.
     """
 
     def OpenSession(self, request, context):
@@ -209,9 +215,12 @@ class Agent(object):
     The step protocol. A session counts its acts. The client sends `step = committed_step + 1`; the answer commits it. Sending the committed step again
     with the same observation gives the same bytes again with `replayed = true` and spends no network evaluation, so a client may retry whenever it is in
     doubt; while the first one still runs, the second waits for its answer. An act that fails, is cancelled or runs out of time changes nothing.
+    A network may deliver a copy late. A client that says to which `episode` an act or a reset belongs is refused (EPISODE_OVER) what comes after the
+    next reset, and one that gives each open and reset a `request_id` of its own may send them again without opening or resetting twice.
 
     Errors carry, besides code and message, these trailers: `ada-reason` (a fixed word such as STEP_OUT_OF_ORDER), and where they mean something `ada-field`
-    (path of the offending field), `ada-committed-step`, `ada-error-id` (to find an internal error in the server's log) and `grpc-retry-pushback-ms`.
+    (path of the offending field), `ada-committed-step`, `ada-episode`, `ada-error-id` (to find an internal error in the server's log) and
+    `grpc-retry-pushback-ms`.
     """
 
     @staticmethod
