@@ -1,6 +1,6 @@
 //! The one accept loop: both faces on one port, every connection bounded in time, and an end that comes.
 
-use crate::serve::{config::Config, grpc, http::Problem};
+use crate::serve::{config::Config, grpc, guard::Guard, http::Problem};
 use axum::{
     Router,
     body::Body,
@@ -45,6 +45,8 @@ pub struct Faces {
     pub grpc: Router,
     /// For everything else.
     pub http: Router,
+    /// Before both.
+    pub guard: Guard,
 }
 
 /// A connection's place among the open ones; whatever outlives the connection (a WebSocket) holds it too.
@@ -176,7 +178,14 @@ async fn answer(request: Request<Incoming>, faces: Faces, gate: Gate) -> Result<
     let span = tracing::info_span!("request", %id, face, method = %request.method());
     let mut request = request.map(Body::new);
     request.extensions_mut().insert(gate);
-    let work = AssertUnwindSafe(router.oneshot(request).instrument(span.clone())).catch_unwind();
+    let refused = faces.guard.refuses(&request);
+    let work = async move {
+        match refused {
+            Some(problem) => Ok(problem.into_response()),
+            None => router.oneshot(request).await,
+        }
+    };
+    let work = AssertUnwindSafe(work.instrument(span.clone())).catch_unwind();
     let mut response = match work.await {
         Ok(Ok(response)) => response,
         Ok(Err(never)) => match never {},

@@ -1,12 +1,13 @@
 //! How checkpoints are used: gRPC and REST over one core, on one port.
 //!
-//! The way of a request: [`listener`] (bytes) -> [`grpc`] or [`http`] (convert) -> [`service`] (verbs) -> [`session`] (lease the episode) -> [`engine`]
+//! The way of a request: [`listener`] (bytes) -> [`guard`] (whom it may come from) -> [`grpc`] or [`http`] (convert) -> [`service`] (verbs) -> [`session`] (lease the episode) -> [`engine`]
 //! (queue, batch, network evaluations) -> [`session`] (commit) -> bytes.
 
 pub mod config;
 pub mod engine;
 pub mod error;
 pub mod grpc;
+pub mod guard;
 pub mod http;
 pub mod listener;
 pub mod registry;
@@ -17,6 +18,7 @@ pub mod session;
 pub mod telemetry;
 
 use config::Config;
+use guard::Guard;
 use listener::Faces;
 use registry::{Registry, RegistryError};
 use service::Service;
@@ -92,7 +94,9 @@ impl Server {
         let service = Arc::new(Service::start(config.clone()).map_err(ServerError::Engine)?);
         let (grpc, health) = grpc::router(service.clone())?;
         grpc::report(&health, false).await;
-        let faces = Faces { grpc, http: http::router(http::State { service: service.clone(), metrics: metrics.clone() }) };
+        let guard = Guard::new(&config.server, listener.local_addr().ok());
+        let http = http::router(http::State { service: service.clone(), metrics: metrics.clone() }).layer(guard.cors());
+        let faces = Faces { grpc, http, guard };
         let leave = CancellationToken::new();
         let mut listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), leave.clone()));
         let serving = async {

@@ -173,6 +173,11 @@ impl Service {
     pub async fn act(&self, request: ActRequest) -> Result<Acted, ServiceError> {
         let (arrived, face) = (Instant::now(), request.face);
         let session = self.registry().and_then(|_| self.session(&request.session_id));
+        if let Err(ServiceError::Draining { .. }) = &session
+            && let Some(acted) = self.committed(&request)
+        {
+            return Ok(acted);
+        }
         let model = session.as_ref().map_or_else(|_| "unknown".into(), |session| session.model.to_string());
         let result = match session {
             Ok(session) => self.act_on(&session, request, arrived).await,
@@ -257,6 +262,14 @@ impl Service {
         self.sessions.close(parse_id(session_id)?, Instant::now())
     }
 
+    /// While draining, the answer of a step that is committed already: whoever lost it is not to lose the act.
+    fn committed(&self, request: &ActRequest) -> Option<Acted> {
+        let session = self.session(&request.session_id).ok()?;
+        let answer = session.replay((request.episode, request.step), key_of(&request.observation))?;
+        metrics::counter!("ada_replays_total", "source" => "memory").increment(1);
+        Some(Acted { answer, replayed: true, want_planned_states: request.want_planned_states })
+    }
+
     async fn act_result(&self, act: Result<ActRequest, ActResult>) -> ActResult {
         match act {
             Ok(act) => {
@@ -293,8 +306,8 @@ impl Service {
                 (waiter, true)
             }
             Entry::Lead(waiter, episode) => {
-                // Whoever is more patient than usual does not wait longer than usual for a turn.
-                let turn_by = arrived + patience.min(usual);
+                // Whoever is patient, or names no deadline, has a turn after a while all the same, before those who are in a hurry and came later.
+                let turn_by = arrived + patience.min(Duration::from_millis(self.config.engine.turn_ms_max));
                 self.submit(Seat { session: session.clone(), flight: waiter.flight().clone() }, Question { episode, observation }, turn_by);
                 (waiter, false)
             }

@@ -45,6 +45,10 @@ pub struct ServerConfig {
     pub drain_notice_ms: u64,
     /// From then on to the hard end of what still runs.
     pub drain_timeout_ms: u64,
+    /// Names that the server answers to, without port, beside those of loopback. Empty: where it listens on loopback its own name alone, else any.
+    pub hosts: Vec<String>,
+    /// Origins of pages that may use it, as browsers write them, e.g. `https://lab.example`; requests of any other page are refused.
+    pub origins: Vec<String>,
 }
 
 /// One connection: time limits and protocol bounds.
@@ -123,6 +127,9 @@ pub struct EngineConfig {
     pub queue_len_max: usize,
     /// Memory of all acts that wait; treated like `queue_len_max`.
     pub queue_bytes_max: usize,
+    /// The queue serves the earliest deadline first, and nobody's as if it were later than this: who is patient does not wait behind all who come later
+    /// and are in a hurry.
+    pub turn_ms_max: u64,
     /// Acts that share one network evaluation of a worker.
     pub batch_len_max: usize,
     /// Whether an act with `deadline_ms` takes larger jumps, or gives out the current window, when it would come too late
@@ -172,7 +179,15 @@ pub enum LogFormat {
 
 impl Default for ServerConfig {
     fn default() -> Self {
-        Self { listen: "127.0.0.1:7777".to_owned(), io_threads: 0, connections_max: 4096, drain_notice_ms: 250, drain_timeout_ms: 10_000 }
+        Self {
+            listen: "127.0.0.1:7777".to_owned(),
+            io_threads: 0,
+            connections_max: 4096,
+            drain_notice_ms: 250,
+            drain_timeout_ms: 10_000,
+            hosts: Vec::new(),
+            origins: Vec::new(),
+        }
     }
 }
 
@@ -227,6 +242,7 @@ impl Default for EngineConfig {
             workers: 0,
             queue_len_max: 1024,
             queue_bytes_max: 64 << 20,
+            turn_ms_max: 200,
             batch_len_max: 32,
             anytime: true,
             deadline_margin_ms: 1,
@@ -246,6 +262,11 @@ impl Default for TelemetryConfig {
     fn default() -> Self {
         Self { log: "info".to_owned(), format: LogFormat::Pretty, log_repeats_max: 20 }
     }
+}
+
+/// Visible ASCII, and something.
+fn is_host(text: &str) -> bool {
+    !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_graphic() && byte != b'/')
 }
 
 /// Why the settings were refused.
@@ -336,6 +357,13 @@ impl Config {
         }
         let range = |key, holds: bool, reason| if holds { Ok(()) } else { Err(ConfigError::Invalid { key, reason }) };
         range("server.listen", is_host_and_port(&self.server.listen), "must be HOST:PORT, e.g. 127.0.0.1:7777 or localhost:7777")?;
+        range(
+            "server.hosts",
+            self.server.hosts.iter().all(|host| is_host(host)),
+            "must list names without scheme and port, e.g. robot.local",
+        )?;
+        let is_origin = |origin: &String| origin.split_once("://").is_some_and(|(_, rest)| !rest.contains('/') && is_host(rest));
+        range("server.origins", self.server.origins.iter().all(is_origin), "must list origins without path, e.g. https://lab.example")?;
         range("connection.header_bytes_max", self.connection.header_bytes_max >= 8192, "must be at least 8192")?;
         range("sessions.ttl_ms", self.sessions.ttl_ms <= self.sessions.ttl_ms_max, "must be at most sessions.ttl_ms_max")?;
         range("limits.json_depth_max", self.limits.json_depth_max <= 128, "must be at most 128")?;

@@ -56,7 +56,8 @@ fn other(key: &str, default: &Value) -> (String, bool) {
         Value::Float(value) => (format!("{:?}", value + 0.5), false),
         Value::Boolean(value) => ((!value).to_string(), false),
         Value::String(_) => (OTHER_WORDS.iter().find(|(word, _)| *word == key).map_or(OTHER_TEXT, |(_, text)| text).to_owned(), true),
-        // Lists and the like are written alike in all three.
+        // Lists are written alike in all three.
+        Value::Array(_) => ("[\"http://a.example\"]".to_owned(), false),
         other => (other.to_string(), false),
     }
 }

@@ -10,6 +10,7 @@ use super::{
 };
 use crate::serve::{
     error::ServiceError,
+    guard,
     request::{ActResult, ListRequest},
 };
 use axum::{
@@ -24,6 +25,7 @@ use axum::{
     response::{IntoResponse, Response},
     routing,
 };
+use hyper::body::Body as _;
 use serde::de::DeserializeOwned;
 use utoipa::OpenApi;
 use utoipa_axum::{router::OpenApiRouter, routes};
@@ -69,7 +71,7 @@ pub fn router(state: State) -> Router {
         .method_not_allowed_fallback(|| async {
             Problem::new(StatusCode::METHOD_NOT_ALLOWED, "METHOD_NOT_ALLOWED", "this path takes other methods; see /openapi.json")
         })
-        .layer(middleware::from_fn(refuse_encoded))
+        .layer(middleware::from_fn(refuse_other_bodies))
         .layer(middleware::from_fn(name_route))
         .with_state(state)
 }
@@ -83,14 +85,21 @@ async fn name_route(route: Option<MatchedPath>, request: Request, next: Next) ->
     response
 }
 
-/// Bodies are read as they come: one that is compressed is refused, with the one encoding that is understood (RFC 9110, 15.5.16).
-async fn refuse_encoded(request: Request, next: Next) -> Response {
+/// Bodies are JSON and say so, which a page cannot do unasked (see [`guard`]); they are read as they come, and one that is compressed is refused
+/// with the one encoding that is understood (RFC 9110, 15.5.16).
+async fn refuse_other_bodies(request: Request, next: Next) -> Response {
     const IDENTITY: HeaderValue = HeaderValue::from_static("identity");
-    if request.headers().get_all(header::CONTENT_ENCODING).iter().all(|encoding| encoding.is_empty() || encoding == IDENTITY) {
+    let headers = request.headers();
+    if !headers.get_all(header::CONTENT_ENCODING).iter().all(|encoding| encoding.is_empty() || encoding == IDENTITY) {
+        let problem = Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "ENCODING_UNSUPPORTED", "send the body without content-encoding");
+        return ([(header::ACCEPT_ENCODING, IDENTITY)], problem).into_response();
+    }
+    let is_empty = request.body().is_end_stream() || request.body().size_hint().exact() == Some(0);
+    if is_empty || guard::is_json(headers) {
         return next.run(request).await;
     }
-    let problem = Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "ENCODING_UNSUPPORTED", "send the body without content-encoding");
-    ([(header::ACCEPT_ENCODING, IDENTITY)], problem).into_response()
+    Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "MEDIA_TYPE_UNSUPPORTED", "send JSON, with content-type: application/json")
+        .into_response()
 }
 
 /// The name in a path; what is not even text is refused like any other wrong field.

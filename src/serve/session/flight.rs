@@ -25,8 +25,8 @@ pub struct Flight {
     /// Nobody can join once this is 0: the flight is over.
     waiters: AtomicUsize,
     computing: AtomicBool,
-    /// When its answer is late for everyone who waits, if all of them prefer a coarser one in time.
-    due: Mutex<Option<Instant>>,
+    /// For each of those who wait, by number, when its answer is late, if it prefers a coarser one in time.
+    dues: Mutex<Vec<(u64, Option<Instant>)>>,
     outcome: watch::Sender<Option<Outcome>>,
     /// Takes the act out of the queue.
     leave: Mutex<Option<Box<dyn FnOnce() + Send>>>,
@@ -35,7 +35,7 @@ pub struct Flight {
 impl Flight {
     pub(super) fn new(step: u64, key: Key, arrived: Instant, due: Option<Instant>) -> Arc<Self> {
         let (waiters, computing, outcome) = (AtomicUsize::new(1), AtomicBool::new(false), watch::Sender::new(None));
-        Arc::new(Self { step, key, arrived, waiters, computing, due: Mutex::new(due), outcome, leave: Mutex::new(None) })
+        Arc::new(Self { step, key, arrived, waiters, computing, dues: Mutex::new(vec![(0, due)]), outcome, leave: Mutex::new(None) })
     }
 
     /// Whether somebody waits and there is no outcome yet.
@@ -63,15 +63,18 @@ impl Flight {
         self.computing.store(true, Ordering::Relaxed);
     }
 
-    /// When a coarser answer is better than a later one; never, if somebody waits who has time.
+    /// When a coarser answer is better than a later one: the most patient of those who wait decides; never, if one of them has time.
     pub fn due(&self) -> Option<Instant> {
-        *self.due.lock()
+        let dues = self.dues.lock();
+        dues.iter().map(|(_, due)| *due).reduce(|most, due| Some(most?.max(due?))).flatten()
     }
 
-    /// One more waits: the most patient decides.
-    fn wait_until(&self, due: Option<Instant>) {
-        let mut first = self.due.lock();
-        *first = first.zip(due).map(|(first, due)| first.max(due));
+    /// One more waits; its number.
+    fn wait_until(&self, due: Option<Instant>) -> u64 {
+        let mut dues = self.dues.lock();
+        let number = dues.iter().map(|(number, _)| number + 1).max().unwrap_or(0);
+        dues.push((number, due));
+        number
     }
 
     /// Queue or compute.
@@ -96,19 +99,20 @@ impl Flight {
 pub struct Waiter {
     session: Arc<Session>,
     flight: Arc<Flight>,
+    number: u64,
 }
 
 impl Waiter {
     pub(super) fn lead(session: &Arc<Session>, flight: Arc<Flight>) -> Self {
-        Self { session: session.clone(), flight }
+        Self { session: session.clone(), flight, number: 0 }
     }
 
     /// None if the last one has left already.
     pub(super) fn join(session: &Arc<Session>, flight: &Arc<Flight>, due: Option<Instant>) -> Option<Self> {
         let one_more = |waiters| (waiters > 0).then_some(waiters + 1);
         flight.waiters.fetch_update(Ordering::AcqRel, Ordering::Acquire, one_more).ok()?;
-        flight.wait_until(due);
-        Some(Self { session: session.clone(), flight: flight.clone() })
+        let number = flight.wait_until(due);
+        Some(Self { session: session.clone(), flight: flight.clone(), number })
     }
 
     /// What it waits for.
@@ -126,6 +130,7 @@ impl Waiter {
 
 impl Drop for Waiter {
     fn drop(&mut self) {
+        self.flight.dues.lock().retain(|(number, _)| *number != self.number);
         if self.flight.waiters.fetch_sub(1, Ordering::AcqRel) == 1 && self.flight.outcome.borrow().is_none() {
             metrics::counter!("ada_cancelled_total", "stage" => self.flight.stage().word()).increment(1);
             self.session.slot.lock().release(&self.flight);

@@ -213,6 +213,14 @@ impl Session {
         Ok(Entry::Lead(waiter, slot.committed.episode.clone()))
     }
 
+    /// The answer of a step that is committed already.
+    pub fn replay(&self, (episode, step): (Option<u64>, u64), key: Key) -> Option<Arc<Answer>> {
+        let slot = self.slot.lock();
+        slot.check_episode(episode).ok()?;
+        let (last_key, answer) = slot.committed.last.as_ref()?;
+        (!slot.ended && step == slot.committed.step && *last_key == key).then(|| answer.clone())
+    }
+
     /// Commits the episode and the answer together, if the flight is still the session's; a flight that was dropped meanwhile changes nothing.
     pub fn commit(&self, flight: &Arc<Flight>, episode: Episode, answer: Answer) {
         let answer = Arc::new(answer);

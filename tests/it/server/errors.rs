@@ -70,12 +70,59 @@ async fn bodies_come_uncompressed() {
     let state = http::State { service, metrics: telemetry::install_metrics() };
     for (encoding, expected) in [("gzip", 415), ("br", 415), ("identity", 503), ("", 503)] {
         let request = hyper::Request::builder().method("POST").uri("/v1/sessions").header("content-encoding", encoding);
+        let request = request.header("content-type", "application/json");
         let response = http::router(state.clone()).oneshot(request.body(Body::from("{}")).unwrap()).await.unwrap();
         assert_eq!(response.status().as_u16(), expected, "{encoding}");
         let accepted = response.headers().get("accept-encoding").map(|value| value.to_str().unwrap());
         assert_eq!(accepted, (expected == 415).then_some("identity"));
         assert_eq!(response.headers()["content-type"], "application/problem+json");
     }
+}
+
+/// Any page that a developer had open could open sessions and act: a body of text/plain needs no leave of the server, nor does a WebSocket.
+#[tokio::test(flavor = "multi_thread")]
+async fn pages_are_refused_unless_listed() {
+    let server = start(|config| config.server.origins = vec!["https://lab.example".to_owned()]).await;
+    let ask = async |method: &str, path: &str, headers: &[(&str, &str)], body: &str| {
+        let stream = TcpStream::connect(server.address).await.unwrap();
+        let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream)).await.unwrap();
+        tokio::spawn(connection.with_upgrades());
+        let request = headers.iter().fold(hyper::Request::builder().method(method).uri(path), |request, (k, v)| request.header(*k, *v));
+        let (parts, body) = sender.send_request(request.body(Body::from(body.to_owned())).unwrap()).await.unwrap().into_parts();
+        let text = if parts.status == 101 {
+            String::new()
+        } else {
+            String::from_utf8(to_bytes(Body::new(body), 9999).await.unwrap().into()).unwrap()
+        };
+        Reply { status: parts.status.as_u16(), headers: parts.headers, text }
+    };
+    let (host, json) = (("host", "localhost:7777"), ("content-type", "application/json"));
+    for kind in ["text/plain", "application/x-www-form-urlencoded", ""] {
+        let reply = ask("POST", "/v1/sessions", &[host, ("content-type", kind)], "{}").await;
+        assert_eq!((reply.status, reply.reason().as_str()), (415, "MEDIA_TYPE_UNSUPPORTED"), "{kind}");
+    }
+    let reply = ask("POST", "/v1/sessions", &[("host", "rebound.example"), json], "{}").await;
+    assert_eq!((reply.status, reply.reason().as_str()), (421, "HOST_FORBIDDEN"));
+    for page in ["https://evil.example", "null", "http://localhost:7777"] {
+        let reply = ask("POST", "/v1/sessions", &[host, json, ("origin", page)], "{}").await;
+        assert_eq!((reply.status, reply.reason().as_str()), (403, "ORIGIN_FORBIDDEN"), "{page}");
+    }
+    let lab = ("origin", "https://lab.example");
+    let reply = ask("POST", "/v1/sessions", &[host, json, lab], "{}").await;
+    assert_eq!((reply.status, reply.headers["access-control-allow-origin"].as_bytes()), (201, b"https://lab.example".as_slice()));
+    let wish = [host, lab, ("access-control-request-method", "POST"), ("access-control-request-headers", "content-type")];
+    let reply = ask("OPTIONS", "/v1/sessions", &wish, "").await;
+    assert_eq!((reply.status, reply.headers["access-control-allow-headers"].as_bytes()), (200, b"content-type,x-request-id".as_slice()));
+    let id = server.open(json!({})).await;
+    let socket = [host, ("connection", "upgrade"), ("upgrade", "websocket"), ("sec-websocket-version", "13")];
+    let upgrade = async |page: &str| {
+        let headers = [socket.as_slice(), &[("sec-websocket-key", "dGhlIHNhbXBsZSBub25jZQ=="), ("origin", page)]].concat();
+        ask("GET", &format!("/v1/sessions/{id}/stream"), &headers, "").await.status
+    };
+    assert_eq!((upgrade("https://evil.example").await, upgrade("https://lab.example").await), (403, 101));
+    // gRPC goes through the same door.
+    let reply = ask("POST", "/ada_diffuser.v1.Models/List", &[host, ("content-type", "application/grpc"), ("origin", "null")], "").await;
+    assert_eq!(reply.status, 403);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -8,7 +8,8 @@ use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
 use tower::ServiceExt;
 
 async fn ask(router: &Router, method: &str, path: &str, body: &str) -> u16 {
-    let request = Request::builder().method(method).uri(path).body(Body::from(body.to_owned())).unwrap();
+    let request =
+        Request::builder().method(method).uri(path).header("content-type", "application/json").body(Body::from(body.to_owned())).unwrap();
     router.clone().oneshot(request).await.unwrap().status().as_u16()
 }
 
@@ -28,6 +29,7 @@ async fn without_models_it_is_not_ready() {
 async fn a_drain_tells_everyone_and_ends() {
     let mut server = start(|config| config.server.drain_notice_ms = 1500).await;
     let id = server.open(json!({})).await;
+    let committed = server.act(&id, 1, &STATE).await.json();
     let mut agent = server.agent().await;
     let mut health = HealthClient::new(server.channel().await);
     let mut serving = async || {
@@ -39,8 +41,11 @@ async fn a_drain_tells_everyone_and_ends() {
     while server.get("/readyz").await.status == 200 {}
     assert_eq!(serving().await, 2, "NOT_SERVING");
     assert_eq!(server.get("/livez").await.status, 200, "draining is not being dead");
-    let grpc = agent.act(act(&id, 1, &STATE)).await.unwrap_err();
-    let http = server.act(&id, 1, &STATE).await;
+    // An answer that was lost can still be had; it was a refusal, and the act was lost with it.
+    let again = server.act(&id, 1, &STATE).await.json();
+    assert_eq!((&again["actions"], &again["replayed"]), (&committed["actions"], &json!(true)));
+    let grpc = agent.act(act(&id, 2, &STATE)).await.unwrap_err();
+    let http = server.act(&id, 2, &STATE).await;
     assert_eq!((failure(&grpc), http.status, http.reason().as_str()), ((Code::Unavailable, "DRAINING".into()), 503, "DRAINING"));
     assert!(http.headers.contains_key("retry-after") && trailer(&grpc, "grpc-retry-pushback-ms").is_some());
     assert_eq!(server.post("/v1/sessions", &json!({})).await.reason(), "DRAINING");
@@ -57,7 +62,10 @@ async fn a_drain_ends_in_bounded_time_whatever_the_clients_do() {
     let mut silent = TcpStream::connect(server.address).await.unwrap();
     silent.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n").await.unwrap();
     let mut stalled = TcpStream::connect(server.address).await.unwrap();
-    stalled.write_all(b"POST /v1/sessions HTTP/1.1\r\nhost: x\r\ncontent-length: 9\r\n\r\n{").await.unwrap();
+    stalled
+        .write_all(b"POST /v1/sessions HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: 9\r\n\r\n{")
+        .await
+        .unwrap();
     tokio::time::sleep(Duration::from_millis(50)).await;
     let begin = Instant::now();
     server.stop.cancel();

@@ -223,7 +223,12 @@ impl Running {
         let stream = TcpStream::connect(self.address).await.unwrap();
         let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream)).await.unwrap();
         let driver = tokio::spawn(connection);
-        let request = hyper::Request::builder().method(method).uri(path).header("host", "test").body(Body::from(body.to_owned()));
+        let request = hyper::Request::builder()
+            .method(method)
+            .uri(path)
+            .header("host", "localhost")
+            .header("content-type", "application/json")
+            .body(Body::from(body.to_owned()));
         let response = sender.send_request(request.unwrap()).await.unwrap();
         let (parts, body) = response.into_parts();
         let bytes = to_bytes(Body::new(body), usize::MAX).await.unwrap();

@@ -69,6 +69,47 @@ async fn one_who_joined_is_served_after_the_first_has_left() {
     assert!(answer.replayed && answer.step == 1);
 }
 
+/// The most patient of those who wait decides whether an act is hurried; once that one had left, nobody was, and the hasty got no answer.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_hasty_are_served_in_time_when_the_patient_have_left() {
+    let (_process, server) = start_process(&["engine.workers=1", "engine.deadline_margin_ms=300"]).await;
+    let id = server.open(json!({"model": "slow"})).await;
+    let patient = server.start_slow(&id).await;
+    let request = pb::ActRequest { deadline_ms: Some(2000), ..act(&id, 1, &STATE) };
+    let (mut agent, joined) = (server.agent().await, server.metric("ada_replays_total").await);
+    let hasty = tokio::spawn(async move { agent.act(request).await });
+    while server.metric("ada_replays_total").await == joined {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    patient.abort();
+    let answer = timeout(Duration::from_secs(10), hasty).await.unwrap().unwrap().expect("it had the time it asked for").into_inner();
+    assert!(answer.degraded);
+}
+
+/// An act without deadline waited behind all that came later and had one, for up to half a minute.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_patient_have_their_turn() {
+    let (_process, server) = start_process(&["engine.workers=1", "engine.deadline_margin_ms=300"]).await;
+    let (first, quick) = (server.open(json!({"model": "slow"})).await, server.open(json!({})).await);
+    let blocker = server.start_slow(&first).await;
+    let patient = server.start_slow(&quick).await;
+    // Longer than `engine.turn_ms_max`.
+    tokio::time::sleep(Duration::from_millis(400)).await;
+    let mut hasty = Vec::new();
+    for _ in 0..3 {
+        let id = server.open(json!({"model": "slow"})).await;
+        let request = pb::ActRequest { deadline_ms: Some(3000), ..act(&id, 1, &STATE) };
+        let mut agent = server.agent().await;
+        hasty.push(tokio::spawn(async move { agent.act(request).await }));
+    }
+    while server.metric("ada_queue_depth").await < 4.0 {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    blocker.abort();
+    timeout(Duration::from_secs(10), patient).await.expect("the patient had no turn").unwrap().unwrap();
+    assert!(hasty.iter().all(|act| !act.is_finished()), "who came later and in a hurry was served before");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_cancelled_act_leaves_the_session_unharmed() {
     let (_process, server) = start_process(&[]).await;
@@ -102,7 +143,10 @@ async fn a_hung_up_rest_act_leaves_the_engine() {
     {
         use tokio::io::AsyncWriteExt;
         let body = json!({"step": 1, "observation": {"state": STATE}}).to_string();
-        let head = format!("POST /v1/sessions/{slow}/act HTTP/1.1\r\nhost: test\r\ncontent-length: {}\r\n\r\n", body.len());
+        let head = format!(
+            "POST /v1/sessions/{slow}/act HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\r\n",
+            body.len()
+        );
         let mut stream = TcpStream::connect(server.address).await.unwrap();
         stream.write_all((head + &body).as_bytes()).await.unwrap();
         server.until(&slow, |session| session["busy"] == true).await;
