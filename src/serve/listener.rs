@@ -1,6 +1,12 @@
 //! The one accept loop: both faces on one port, every connection bounded in time, and an end that comes.
 
-use crate::serve::{config::Config, grpc, guard::Guard, http::Problem};
+use crate::serve::{
+    config::Config,
+    connections::{Activity, Place, Places, Verdict, look_interval},
+    grpc,
+    guard::Guard,
+    http::Problem,
+};
 use axum::{
     Router,
     body::Body,
@@ -14,18 +20,19 @@ use hyper_util::{
     rt::{TokioExecutor, TokioIo, TokioTimer},
     server::conn::auto,
 };
-use std::{convert::Infallible, panic::AssertUnwindSafe, pin::pin, sync::Arc, time::Duration, time::Instant};
+use std::{convert::Infallible, error::Error, io, panic::AssertUnwindSafe, pin::pin, sync::Arc, time::Duration, time::Instant};
 use tokio::{
     io::AsyncWriteExt,
     net::{TcpListener, TcpStream},
-    sync::{OwnedSemaphorePermit, Semaphore},
-    time::{sleep, timeout},
+    time::{interval, sleep, timeout},
 };
+use tokio_io_timeout::TimeoutStream;
 use tokio_util::{
     sync::CancellationToken,
     task::{TaskTracker, task_tracker::TaskTrackerToken},
 };
 use tower::ServiceExt;
+use tower_http::timeout::TimeoutBody;
 use tracing::Instrument;
 use uuid::Uuid;
 
@@ -52,7 +59,7 @@ pub struct Faces {
 /// A connection's place among the open ones; whatever outlives the connection (a WebSocket) holds it too.
 #[derive(Clone)]
 pub struct Gate {
-    _place: Arc<(OwnedSemaphorePermit, TaskTrackerToken)>,
+    _place: Arc<(Place, TaskTrackerToken)>,
     hard_end: CancellationToken,
 }
 
@@ -69,19 +76,19 @@ impl Gate {
 /// Serves both faces until `leave` is cancelled, then lets every request in flight end, for `server.drain_timeout_ms` at most.
 pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
     let (tracker, hard_end) = (TaskTracker::new(), CancellationToken::new());
-    let places = Arc::new(Semaphore::new(config.server.connections_max));
+    let places = Places::new(&config.server);
     loop {
         let accepted = tokio::select! {
             () = leave.cancelled() => break,
             accepted = listener.accept() => accepted,
         };
         match accepted {
-            Ok((stream, _)) => match places.clone().try_acquire_owned() {
-                Ok(permit) => {
-                    let gate = Gate { _place: Arc::new((permit, tracker.token())), hard_end: hard_end.clone() };
+            Ok((stream, peer)) => match places.take(peer.ip()) {
+                Some(place) => {
+                    let gate = Gate { _place: Arc::new((place, tracker.token())), hard_end: hard_end.clone() };
                     tokio::spawn(connection(stream, faces.clone(), config.clone(), leave.clone(), gate));
                 }
-                Err(_) => turn_away(stream),
+                None => turn_away(stream),
             },
             Err(error) => {
                 tracing::warn!(%error, "accept failed");
@@ -134,19 +141,60 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &Cancella
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "no TCP_NODELAY");
     }
-    let answer = service_fn(|request| answer(request, faces.clone(), gate.clone()));
+    let activity = Activity::new(Instant::now());
+    let ms = Duration::from_millis;
+    let patience = Patience { body: ms(config.connection.body_read_timeout_ms), write: ms(config.connection.write_timeout_ms) };
+    let answer = service_fn(|request| answer(request, faces.clone(), gate.clone(), activity.clone(), patience));
     let builder = builder(config);
-    let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(stream), answer));
-    let ended = tokio::select! {
-        ended = connection.as_mut() => ended,
-        () = leave.cancelled() => {
-            connection.as_mut().graceful_shutdown();
-            connection.await
+    let mut stream = TimeoutStream::new(stream);
+    stream.set_write_timeout(Some(patience.write));
+    let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(Box::pin(stream)), answer));
+    let (mut looks, mut is_leaving) = (interval(look_interval(config)), false);
+    let idle_max = Duration::from_millis(config.connection.idle_timeout_ms);
+    let ended = loop {
+        tokio::select! {
+            ended = connection.as_mut() => break ended,
+            () = leave.cancelled(), if !is_leaving => {
+                is_leaving = true;
+                connection.as_mut().graceful_shutdown();
+            }
+            _ = looks.tick() => match activity.verdict(idle_max, Instant::now()) {
+                Verdict::Leave if !is_leaving => {
+                    is_leaving = true;
+                    metrics::counter!("ada_connections_timed_out_total").increment(1);
+                    connection.as_mut().graceful_shutdown();
+                }
+                // One that was asked and does not go holds its place for nothing.
+                Verdict::Leave if !leave.is_cancelled() => break Ok(()),
+                Verdict::Cut => {
+                    metrics::counter!("ada_connections_timed_out_total").increment(1);
+                    break Ok(());
+                }
+                Verdict::Leave | Verdict::Stay => {}
+            },
         }
     };
     if let Err(error) = ended {
+        if is_late(&*error) {
+            metrics::counter!("ada_connections_timed_out_total").increment(1);
+        }
         tracing::debug!(%error, "connection ended");
     }
+}
+
+/// Whether a piece of an answer was not taken in time.
+fn is_late(error: &(dyn Error + 'static)) -> bool {
+    let is_cause = error.downcast_ref::<io::Error>().is_some_and(|error| error.kind() == io::ErrorKind::TimedOut);
+    is_cause || error.source().is_some_and(is_late)
+}
+
+/// How long the server waits for a client.
+#[derive(Clone, Copy)]
+struct Patience {
+    /// For the next piece of a unary gRPC request.
+    body: Duration,
+    /// For an answer to be taken: for each piece that the system does not take at once, and for all of it from its head on.
+    write: Duration,
 }
 
 fn builder(config: &Config) -> auto::Builder<TokioExecutor> {
@@ -170,13 +218,24 @@ fn builder(config: &Config) -> auto::Builder<TokioExecutor> {
 }
 
 /// One request of either face: its id, its log span, its metrics, and a last net for panics.
-async fn answer(request: Request<Incoming>, faces: Faces, gate: Gate) -> Result<Response<Body>, Infallible> {
+async fn answer(
+    request: Request<Incoming>,
+    faces: Faces,
+    gate: Gate,
+    activity: Arc<Activity>,
+    patience: Patience,
+) -> Result<Response<Body>, Infallible> {
+    let open = activity.begin();
     let begin = Instant::now();
     let is_grpc = grpc::is_grpc(request.headers());
     let (face, router) = if is_grpc { ("grpc", faces.grpc) } else { ("http", faces.http) };
     let (id, path) = (request_id(&request), request.uri().path().to_owned());
     let span = tracing::info_span!("request", %id, face, method = %request.method());
-    let mut request = request.map(Body::new);
+    let is_stream = is_grpc && grpc::is_stream(&path);
+    let mut request = request.map(|body| match is_grpc && !is_stream {
+        true => Body::new(TimeoutBody::new(patience.body, body)),
+        false => Body::new(body),
+    });
     request.extensions_mut().insert(gate);
     let refused = faces.guard.refuses(&request);
     let work = async move {
@@ -202,7 +261,8 @@ async fn answer(request: Request<Incoming>, faces: Faces, gate: Gate) -> Result<
     if let Ok(id) = HeaderValue::from_str(&id) {
         response.headers_mut().insert(REQUEST_ID, id);
     }
-    Ok(response)
+    let until = (!is_stream).then(|| Instant::now() + patience.write);
+    Ok(response.map(|body| open.until_taken(body, until)))
 }
 
 /// The route as a label: never a path that a client made up.

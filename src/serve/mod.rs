@@ -4,6 +4,7 @@
 //! (queue, batch, network evaluations) -> [`session`] (commit) -> bytes.
 
 pub mod config;
+pub mod connections;
 pub mod engine;
 pub mod error;
 pub mod grpc;

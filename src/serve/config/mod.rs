@@ -41,6 +41,8 @@ pub struct ServerConfig {
     pub io_threads: usize,
     /// Open connections; one more is answered 503 and closed.
     pub connections_max: usize,
+    /// Open connections from one address; the others find a place all the same.
+    pub connections_per_address_max: usize,
     /// From the signal to end until connections are asked to leave; new work is refused (DRAINING) and `/readyz` fails, so that everyone can learn of it.
     pub drain_notice_ms: u64,
     /// From then on to the hard end of what still runs.
@@ -59,8 +61,12 @@ pub struct ConnectionConfig {
     pub preface_timeout_ms: u64,
     /// Until a request's headers are complete (HTTP/1), the time between requests included.
     pub header_read_timeout_ms: u64,
-    /// Until a REST body is complete.
+    /// Until a REST body is complete; between two pieces of a gRPC request that is no stream.
     pub body_read_timeout_ms: u64,
+    /// Until an answer is taken, from its head on; then the connection is cut. Streams may take their time.
+    pub write_timeout_ms: u64,
+    /// A connection without any request for so long is asked to leave, whatever pings it answers.
+    pub idle_timeout_ms: u64,
     /// Bytes of all headers of a request.
     pub header_bytes_max: u32,
     /// Number of headers of a request (HTTP/1).
@@ -183,6 +189,7 @@ impl Default for ServerConfig {
             listen: "127.0.0.1:7777".to_owned(),
             io_threads: 0,
             connections_max: 4096,
+            connections_per_address_max: 2048,
             drain_notice_ms: 250,
             drain_timeout_ms: 10_000,
             hosts: Vec::new(),
@@ -197,6 +204,8 @@ impl Default for ConnectionConfig {
             preface_timeout_ms: 5_000,
             header_read_timeout_ms: 10_000,
             body_read_timeout_ms: 10_000,
+            write_timeout_ms: 30_000,
+            idle_timeout_ms: 300_000,
             header_bytes_max: 16_384,
             headers_max: 64,
             streams_max: 128,
@@ -375,11 +384,14 @@ impl Config {
     }
 
     /// Settings that make no sense as 0.
-    fn positive(&self) -> [(&'static str, u64); 24] {
+    fn positive(&self) -> [(&'static str, u64); 27] {
         let (connection, limits, sessions, engine) = (&self.connection, &self.limits, &self.sessions, &self.engine);
         [
             ("server.connections_max", self.server.connections_max as u64),
             ("connection.preface_timeout_ms", connection.preface_timeout_ms),
+            ("server.connections_per_address_max", self.server.connections_per_address_max as u64),
+            ("connection.write_timeout_ms", connection.write_timeout_ms),
+            ("connection.idle_timeout_ms", connection.idle_timeout_ms),
             ("connection.header_read_timeout_ms", connection.header_read_timeout_ms),
             ("connection.body_read_timeout_ms", connection.body_read_timeout_ms),
             ("connection.headers_max", connection.headers_max as u64),

@@ -181,6 +181,11 @@ impl models_server::Models for Face {
     }
 }
 
+/// Whether a method of this face is a stream, of requests or of answers.
+pub fn is_stream(path: &str) -> bool {
+    ["/ActStream", "/Watch", "/ServerReflectionInfo"].iter().any(|method| path.ends_with(method))
+}
+
 /// Whether a request is meant for this face.
 pub fn is_grpc(headers: &HeaderMap) -> bool {
     let kind = headers.get("content-type").map(axum::http::HeaderValue::as_bytes);

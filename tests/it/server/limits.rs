@@ -135,3 +135,79 @@ async fn metrics_are_documented() {
     assert!(text.contains("# HELP ada_acts_total") && text.contains(r#"face="http""#));
     assert!(!text.contains(&id), "no session id is ever a label");
 }
+
+/// An HTTP/2 connection, and the end of it.
+async fn http2(address: SocketAddr) -> (hyper::client::conn::http2::SendRequest<Body>, JoinHandle<()>) {
+    let stream = TcpStream::connect(address).await.unwrap();
+    let executor = hyper_util::rt::TokioExecutor::new();
+    let (sender, connection) = hyper::client::conn::http2::handshake(executor, TokioIo::new(stream)).await.unwrap();
+    // Whether it ends well or badly is not the question here.
+    (sender, tokio::spawn(async move { drop(connection.await) }))
+}
+
+/// Connections that only answered pings held their places for ever: 4,096 of them locked everyone out.
+#[tokio::test(flavor = "multi_thread")]
+async fn idle_connections_leave_and_streams_stay() {
+    let server = start(|config| config.connection.idle_timeout_ms = 300).await;
+    let (sender, ended) = http2(server.address).await;
+    let mut agent = server.agent().await;
+    let stream = agent.act_stream(futures_util::stream::pending::<pb::ActRequest>()).await.unwrap();
+    timeout(Duration::from_secs(5), ended).await.expect("it holds its place").unwrap();
+    drop(sender);
+    tokio::time::sleep(Duration::from_millis(600)).await;
+    let id = server.open(json!({})).await;
+    assert_eq!(agent.act(act(&id, 1, &STATE)).await.unwrap().into_inner().step, 1, "the stream keeps its connection");
+    drop(stream);
+}
+
+/// Whoever asks and does not take the answers makes the server keep them.
+#[tokio::test(flavor = "multi_thread")]
+async fn answers_that_are_not_taken_cut_the_connection() {
+    let server = start(|config| config.connection.write_timeout_ms = 300).await;
+    let mut stream = TcpStream::connect(server.address).await.unwrap();
+    // More than the sockets on the way hold.
+    const ASKED: usize = 2_000;
+    let asking = stream.write_all("GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n\r\n".repeat(ASKED).into_bytes().leak());
+    let _not_all_is_taken = timeout(Duration::from_secs(2), asking).await;
+    tokio::time::sleep(Duration::from_millis(1500)).await;
+    let taken = answer_of(&mut stream).await.matches("HTTP/1.1 200").count();
+    assert!((1..ASKED).contains(&taken), "{taken}");
+    assert!(server.metric("ada_connections_timed_out_total").await >= 1.0);
+}
+
+/// A unary gRPC request whose body stops on the way waited for ever.
+#[tokio::test(flavor = "multi_thread")]
+async fn unfinished_grpc_requests_end() {
+    let server = start(|config| config.connection.body_read_timeout_ms = 300).await;
+    let (mut sender, _connection) = http2(server.address).await;
+    let begun = Body::from_stream(futures_util::StreamExt::chain(
+        futures_util::stream::iter([Ok::<_, std::io::Error>(vec![0_u8, 0, 0, 0, 9, 1])]),
+        futures_util::stream::pending(),
+    ));
+    let request = hyper::Request::post(format!("http://{}/ada_diffuser.v1.Agent/Act", server.address));
+    let request = request.header("content-type", "application/grpc").header("te", "trailers").body(begun).unwrap();
+    let response = timeout(Duration::from_secs(5), sender.send_request(request)).await.expect("it waits for ever").unwrap();
+    assert_ne!(response.headers().get("grpc-status").map(hyper::header::HeaderValue::as_bytes), Some(b"0".as_slice()));
+}
+
+/// One address has its share of the places, and another finds one all the same.
+#[tokio::test(flavor = "multi_thread")]
+async fn one_address_does_not_take_all_places() {
+    let server = start(|config| config.server.connections_per_address_max = 8).await;
+    let from = async |address: &str| {
+        let socket = tokio::net::TcpSocket::new_v4().unwrap();
+        socket.bind(format!("{address}:0").parse().unwrap()).unwrap();
+        let mut stream = socket.connect(server.address).await.unwrap();
+        stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n").await.unwrap();
+        stream
+    };
+    let mut held = Vec::new();
+    for _ in 0..12 {
+        held.push(from("127.0.0.1").await);
+    }
+    let mut newcomer = from("127.0.0.2").await;
+    newcomer.write_all(b"connection: close\r\n\r\n").await.unwrap();
+    assert!(answer_of(&mut newcomer).await.starts_with("HTTP/1.1 200"));
+    let mut last = held.pop().unwrap();
+    assert!(answer_of(&mut last).await.starts_with("HTTP/1.1 503"));
+}
