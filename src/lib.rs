@@ -17,7 +17,8 @@
 //! these borders.
 //!
 //! # One request, followed by hand
-//! 1. Bytes arrive at [`serve::listener`]; [`serve::grpc`] or [`serve::http`] turns them into a request of the core and checks them.
+//! 1. Bytes arrive at [`serve::listener`], if their connection has a place ([`serve::connections`]) and the request may come from where it
+//!    says ([`serve::guard`]); [`serve::grpc`] or [`serve::http`] turns them into a request of the core and checks them.
 //! 2. [`serve::session`] compares the step with the committed one: a retry is answered from memory, a wrong step refused; otherwise the
 //!    episode, an immutable value ([`model::agent::Episode`]), is leased.
 //! 3. [`model::agent::Agent::begin`] checks the observation and makes a [`model::agent::Descent`]: a window on its way down the ladder

@@ -99,7 +99,8 @@ async fn broken_models_cost_themselves() {
     noisy.sampler.temperature = 10.0;
     // Its output is not finite for any state.
     alter(&dir.path().join("never-finite"), &noisy, 3e38);
-    let absurd: [(&str, fn(&mut ModelConfig)); 6] = [
+    type Change = fn(&mut ModelConfig);
+    let absurd: [(&str, Change); 6] = [
         ("levels", |config| config.level_max = 1_000_000_000_000),
         ("block", |config| config.block_len = 1 << 62),
         ("horizon", |config| config.plan_horizon = usize::MAX / 2),
