@@ -269,7 +269,7 @@ impl Default for ModelsConfig {
 
 impl Default for TelemetryConfig {
     fn default() -> Self {
-        Self { log: "info".to_owned(), format: LogFormat::Pretty, log_repeats_max: 20 }
+        Self { log: "info".to_owned(), format: LogFormat::Pretty, log_repeats_max: 200 }
     }
 }
 

@@ -132,12 +132,17 @@ impl Sessions {
         }
         let session = self.add(opening, now)?;
         // Of two that came at the same time the first one's session is that of both.
-        let first = *self.opened.lock().entry(name).or_insert(session.id);
+        let first = *self.opened.lock().entry(name.clone()).or_insert(session.id);
         if first == session.id {
             return Ok(session);
         }
+        let Ok(other) = self.get(first, now) else {
+            // It has ended, and is about to be forgotten.
+            self.opened.lock().insert(name, session.id);
+            return Ok(session);
+        };
         self.close(session.id, now)?;
-        same_model(self.get(first, now)?, &model)
+        same_model(other, &model)
     }
 
     fn opened(&self, name: &str, now: Instant) -> Option<Arc<Session>> {
