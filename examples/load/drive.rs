@@ -1,16 +1,21 @@
 //! The clients of one connection, by face.
 
 use super::{
-    flags::Face,
+    flags::{Face, Flags},
     pace::Pace,
     session::{Agent, Failure, Outcome, Session, outcome},
     tally::Tally,
 };
 use ada_diffuser::serve::grpc::pb::{ActBatchRequest, ActRequest, ActResult};
-use std::{collections::HashMap, sync::Arc, time::Instant};
+use std::{
+    collections::HashMap,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 use tokio::{
     sync::mpsc::{Sender, UnboundedReceiver, UnboundedSender, channel, unbounded_channel},
     task::JoinSet,
+    time::timeout,
 };
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Streaming;
@@ -27,7 +32,7 @@ pub struct Group {
 
 /// Where a client sends its acts.
 enum Line {
-    Unary(Agent),
+    Unary { agent: Agent, patience: Option<Duration> },
     Stream { acts: Sender<ActRequest>, results: UnboundedReceiver<ActResult> },
 }
 
@@ -35,7 +40,11 @@ impl Line {
     async fn ask(&mut self, act: ActRequest) -> Outcome {
         let ended = || Failure::new("STREAM_ENDED");
         match self {
-            Self::Unary(agent) => Ok(agent.act(act).await?.into_inner()),
+            Self::Unary { agent, patience: None } => Ok(agent.act(act).await?.into_inner()),
+            Self::Unary { agent, patience: Some(patience) } => match timeout(*patience, agent.act(act)).await {
+                Ok(answer) => Ok(answer?.into_inner()),
+                Err(_) => Err(Failure::new("GAVE_UP")),
+            },
             Self::Stream { acts, results } => {
                 acts.send(act).await.map_err(|_| ended())?;
                 outcome(results.recv().await.ok_or_else(ended)?)
@@ -48,10 +57,11 @@ impl Line {
 ///
 /// # Errors
 /// If the stream cannot be opened.
-pub async fn start(group: Group, face: Face, tally: &Arc<Tally>, clients: &mut JoinSet<Vec<Session>>) -> Result<(), Failure> {
+pub async fn start(group: Group, flags: &Flags, tally: &Arc<Tally>, clients: &mut JoinSet<Vec<Session>>) -> Result<(), Failure> {
     let Group { agent, sessions, mut paces } = group;
-    let lines = match face {
-        Face::Unary => sessions.iter().map(|_| Line::Unary(agent.clone())).collect(),
+    let patience = flags.give_up_ms.map(Duration::from_millis);
+    let lines = match flags.face {
+        Face::Unary => sessions.iter().map(|_| Line::Unary { agent: agent.clone(), patience }).collect(),
         Face::Stream => open_stream(agent, &sessions).await?,
         Face::Batch => {
             let pace = paces.pop().ok_or_else(|| Failure::new("NO_PACE"))?;

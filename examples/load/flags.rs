@@ -54,6 +54,9 @@ pub struct Flags {
     /// Time that an act may take on the server.
     #[arg(long, value_name = "MS")]
     pub deadline_ms: Option<u32>,
+    /// Time after which a client hangs up, without having told the server that it would (face unary).
+    #[arg(long, value_name = "MS", conflicts_with = "face")]
+    pub give_up_ms: Option<u64>,
     /// Opens N more sessions first, acts once in each, and leaves them alone until the end.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub idle_sessions: usize,

@@ -109,7 +109,7 @@ async fn measure(
     for (agent, sessions) in groups {
         let own = if flags.face == Face::Batch { 1 } else { sessions.len() };
         let group = Group { agent, sessions, paces: paces.split_off(paces.len() - own) };
-        let started = drive::start(group, flags.face, &tally, &mut clients).await;
+        let started = drive::start(group, flags, &tally, &mut clients).await;
         started.map_err(|failure| anyhow!("the stream was refused: {}", failure.reason))?;
     }
     let coming_and_going = tokio::spawn(churn(aside.agent, aside.opening, flags.churn, tally.clone()));

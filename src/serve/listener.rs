@@ -60,10 +60,16 @@ pub struct Faces {
 #[derive(Clone)]
 pub struct Gate {
     _place: Arc<(Place, TaskTrackerToken)>,
+    client: u64,
     hard_end: CancellationToken,
 }
 
 impl Gate {
+    /// Number of the connection.
+    pub fn client(&self) -> u64 {
+        self.client
+    }
+
     /// Runs it to its end, or to the server's hard end.
     pub async fn until_hard_end(&self, work: impl Future<Output = ()>) {
         tokio::select! {
@@ -77,6 +83,7 @@ impl Gate {
 pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
     let (tracker, hard_end) = (TaskTracker::new(), CancellationToken::new());
     let places = Places::new(&config.server);
+    let mut client = 0;
     loop {
         let accepted = tokio::select! {
             () = leave.cancelled() => break,
@@ -85,7 +92,8 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
         match accepted {
             Ok((stream, peer)) => match places.take(peer.ip()) {
                 Some(place) => {
-                    let gate = Gate { _place: Arc::new((place, tracker.token())), hard_end: hard_end.clone() };
+                    client += 1;
+                    let gate = Gate { _place: Arc::new((place, tracker.token())), client, hard_end: hard_end.clone() };
                     tokio::spawn(connection(stream, faces.clone(), config.clone(), leave.clone(), gate));
                 }
                 None => turn_away(stream),

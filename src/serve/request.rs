@@ -28,6 +28,15 @@ impl Face {
     }
 }
 
+/// Who asks: a label of metrics, and a number by which the engine lets one wait behind its own acts rather than others behind them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Caller {
+    /// Which face it came through.
+    pub face: Face,
+    /// The connection.
+    pub client: u64,
+}
+
 /// Overrides of a model's sampling defaults; None: as the model has it. Fields as in [`SamplerOptions`].
 #[derive(Clone, Debug, Default, PartialEq)]
 #[allow(missing_docs)]
@@ -103,8 +112,8 @@ pub struct ActRequest {
     pub timeout: Option<Duration>,
     /// Whether the client wants the planned states with the answer.
     pub want_planned_states: bool,
-    /// Which face it came through.
-    pub face: Face,
+    /// Who asks.
+    pub caller: Caller,
 }
 
 /// An answered act.

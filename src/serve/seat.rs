@@ -1,8 +1,8 @@
 //! The engine's ticket: it brings the outcome of an act home to its session.
 
 use crate::serve::{
-    engine::{Failure, Finished, Ticket},
-    error::ServiceError,
+    engine::{Failure, Finished, Patience, Ticket},
+    error::{ServiceError, Stage},
     session::{Answer, Flight, Session, Timings},
 };
 use std::{sync::Arc, time::Instant};
@@ -15,6 +15,8 @@ pub(super) const RETRY_AFTER_RESTART_MS: u64 = 1_000;
 pub(super) struct Seat {
     pub session: Arc<Session>,
     pub flight: Arc<Flight>,
+    /// What its caller is told to wait if it has to leave a full queue.
+    pub retry_after_ms: u64,
 }
 
 impl Ticket for Seat {
@@ -26,15 +28,16 @@ impl Ticket for Seat {
         self.flight.start();
     }
 
-    fn due(&self) -> Option<Instant> {
-        self.flight.due()
+    fn patience(&self) -> Patience {
+        self.flight.patience()
     }
 
     fn settle(self, outcome: Result<Finished, Failure>) {
-        let Self { session, flight } = &self;
+        let Self { session, flight, retry_after_ms } = &self;
         match outcome {
             Ok(Finished { episode, chunk, queue, compute, at }) => {
-                let now = Instant::now();
+                let (now, evaluations) = (Instant::now(), chunk.evaluations.into());
+                metrics::counter!("ada_network_evaluations_total", "model" => session.model.to_string()).increment(evaluations);
                 let timings = Timings { queue, compute, commit: now - at, total: now - flight.arrived };
                 let (model, model_digest) = (session.model.clone(), session.agent.spec().digest.clone());
                 let answer = Answer { session: session.id, step: flight.step, chunk, timings, model, model_digest };
@@ -42,6 +45,8 @@ impl Ticket for Seat {
             }
             Err(Failure::Agent(error)) => session.fail(flight, ServiceError::from_agent(error)),
             Err(Failure::Panic) => self.panicked("the model panicked over an act"),
+            Err(Failure::Late) => session.fail(flight, ServiceError::Deadline { stage: Stage::Queue }),
+            Err(Failure::Displaced) => session.fail(flight, ServiceError::QueueFull { retry_after_ms: *retry_after_ms }),
             Err(Failure::Stopped) => session.fail(flight, ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS }),
         }
     }

@@ -4,10 +4,10 @@ use crate::{
     model::agent::Episode,
     serve::{
         config::{Config, EngineConfig},
-        engine::{Engine, EngineOptions, Failure, Job, Question, Refusal},
+        engine::{Engine, EngineOptions, Failure, Job, Patience, Question, Refusal},
         error::{ServiceError, Stage},
         registry::{Model, Registry, RegistryError},
-        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, Page, ResetRequest},
+        request::{ActRequest, ActResult, Acted, Caller, ListRequest, OpenRequest, Page, ResetRequest},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
         session::{Answer, Entry, Opening, Session, Sessions, Summary, Waiter, key_of},
         telemetry,
@@ -44,9 +44,10 @@ impl Service {
     /// # Errors
     /// If the system gives no threads for the engine.
     pub fn start(config: Config) -> std::io::Result<Self> {
-        let EngineConfig { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin_ms, .. } = config.engine;
-        let deadline_margin = Duration::from_millis(deadline_margin_ms);
-        let engine = Engine::start(EngineOptions { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin })?;
+        let EngineConfig { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin_ms, wait_ms_max, .. } = config.engine;
+        let [deadline_margin, wait_max] = [deadline_margin_ms, wait_ms_max].map(Duration::from_millis);
+        let options = EngineOptions { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin, wait_max };
+        let engine = Engine::start(options)?;
         let sessions = Sessions::new(config.sessions.clone());
         Ok(Self { config, registry: OnceLock::new(), sessions, engine, draining: CancellationToken::new() })
     }
@@ -63,7 +64,7 @@ impl Service {
                 Ok(()) => tracing::info!(model = %model.name, ms = begin.elapsed().as_millis() as u64, "warmed up"),
                 Err(Failure::Stopped) => {}
                 Err(Failure::Agent(error)) => return Err(error.to_string()),
-                Err(Failure::Panic) => return Err("it panics".to_owned()),
+                Err(Failure::Panic | Failure::Late | Failure::Displaced) => return Err("it panics".to_owned()),
             }
             Ok(())
         })
@@ -129,6 +130,7 @@ impl Service {
         telemetry::count_left_out();
         metrics::gauge!("ada_queue_depth").set(waiting as f64);
         metrics::gauge!("ada_inflight_acts").set(running as f64);
+        metrics::gauge!("ada_queue_wait_estimate_seconds").set(self.engine.expected_wait().as_secs_f64());
         metrics::gauge!("ada_sessions").set(self.sessions.len() as f64);
         metrics::gauge!("ada_session_state_bytes").set(self.sessions.bytes() as f64);
     }
@@ -171,20 +173,21 @@ impl Service {
     /// # Errors
     /// Every row of the error table; the session is as before.
     pub async fn act(&self, request: ActRequest) -> Result<Acted, ServiceError> {
-        let (arrived, face) = (Instant::now(), request.face);
+        let mut count = Count { arrived: Instant::now(), caller: request.caller, model: "unknown".to_owned(), is_told: false };
         let session = self.registry().and_then(|_| self.session(&request.session_id));
         if let Err(ServiceError::Draining { .. }) = &session
             && let Some(acted) = self.committed(&request)
         {
-            return Ok(acted);
+            return count.told(Ok(acted));
         }
-        let model = session.as_ref().map_or_else(|_| "unknown".into(), |session| session.model.to_string());
         let result = match session {
-            Ok(session) => self.act_on(&session, request, arrived).await,
+            Ok(session) => {
+                count.model = session.model.to_string();
+                self.act_on(&session, request, count.arrived).await
+            }
             Err(error) => Err(error),
         };
-        count_act(model, face, arrived, &result);
-        result
+        count.told(result)
     }
 
     /// ActBatch: each act has its own answer or error, in the order of the acts.
@@ -281,7 +284,7 @@ impl Service {
     }
 
     async fn act_on(&self, session: &Arc<Session>, request: ActRequest, arrived: Instant) -> Result<Acted, ServiceError> {
-        let ActRequest { step, episode, observation, deadline, timeout, want_planned_states, .. } = request;
+        let ActRequest { step, episode, observation, deadline, timeout, want_planned_states, caller, .. } = request;
         let limits = &self.config.limits;
         if observation.executed.len() > limits.executed_len_max {
             metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
@@ -296,7 +299,8 @@ impl Service {
         }
         let acted = |answer, replayed| Acted { answer, replayed, want_planned_states };
         let due = deadline.filter(|_| self.config.engine.anytime).map(|_| arrived + patience);
-        let (waiter, replayed) = match session.enter((episode, step), key_of(&observation), arrived, due)? {
+        let waits = Patience { due, ends: Some(arrived + stays) };
+        let (waiter, replayed) = match session.enter((episode, step), key_of(&observation), arrived, waits)? {
             Entry::Replay(answer) => {
                 metrics::counter!("ada_replays_total", "source" => "memory").increment(1);
                 return Ok(acted(answer, true));
@@ -308,7 +312,9 @@ impl Service {
             Entry::Lead(waiter, episode) => {
                 // Whoever is patient, or names no deadline, has a turn after a while all the same, before those who are in a hurry and came later.
                 let turn_by = arrived + patience.min(Duration::from_millis(self.config.engine.turn_ms_max));
-                self.submit(Seat { session: session.clone(), flight: waiter.flight().clone() }, Question { episode, observation }, turn_by);
+                let retry_after_ms = self.config.engine.retry_after_ms;
+                let seat = Seat { session: session.clone(), flight: waiter.flight().clone(), retry_after_ms };
+                self.submit(seat, Question { episode, observation }, turn_by, caller.client);
                 (waiter, false)
             }
         };
@@ -316,23 +322,23 @@ impl Service {
     }
 
     /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
-    fn submit(&self, seat: Seat, question: Question, turn_by: Instant) {
+    fn submit(&self, seat: Seat, question: Question, turn_by: Instant, client: u64) {
         let agent = seat.session.agent.clone();
         let descent = match question.begin(&agent) {
             Ok(descent) => descent,
             Err(error) => return seat.session.fail(&seat.flight, ServiceError::from_agent(error)),
         };
-        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now(), turn_by };
+        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now(), turn_by, client };
         let flight = job.ticket.flight.clone();
         let (refusal, job) = match self.engine.submit(job) {
             Ok(waiting) => return flight.waits(|| waiting.leave()),
             Err(refused) => refused,
         };
+        let retry_after_ms = self.config.engine.retry_after_ms;
         let error = match refusal {
-            Refusal::Full => {
-                metrics::counter!("ada_shed_total", "reason" => "QUEUE_FULL").increment(1);
-                ServiceError::QueueFull { retry_after_ms: self.config.engine.retry_after_ms }
-            }
+            Refusal::Full => ServiceError::QueueFull { retry_after_ms },
+            Refusal::Slow(excess) => ServiceError::QueueFull { retry_after_ms: retry_after_ms.max(excess.as_millis() as u64) },
+            Refusal::Late => ServiceError::Deadline { stage: Stage::Admission },
             Refusal::Closed => ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS },
         };
         job.ticket.session.fail(&job.ticket.flight, error);
@@ -382,26 +388,54 @@ fn draw_seed() -> u64 {
     random_low_bits & ((1 << DRAWN_SEED_BITS) - 1)
 }
 
-fn count_act(model: String, face: Face, arrived: Instant, result: &Result<Acted, ServiceError>) {
-    let code = result.as_ref().map_or_else(ServiceError::reason, |_| "OK");
-    metrics::counter!("ada_acts_total", "model" => model.clone(), "face" => face.word(), "code" => code).increment(1);
-    match result {
-        Ok(acted) => {
-            metrics::histogram!("ada_act_duration_seconds", "model" => model.clone()).record(arrived.elapsed().as_secs_f64());
-            if !acted.replayed {
-                let Answer { chunk, timings, .. } = &*acted.answer;
-                metrics::histogram!("ada_act_queue_seconds").record(timings.queue.as_secs_f64());
-                metrics::histogram!("ada_act_compute_seconds").record(timings.compute.as_secs_f64());
-                metrics::histogram!("ada_act_commit_seconds").record(timings.commit.as_secs_f64());
-                metrics::histogram!("ada_act_network_evaluations").record(f64::from(chunk.evaluations));
-                metrics::counter!("ada_network_evaluations_total", "model" => model).increment(chunk.evaluations.into());
+/// An act on its way through the metrics: whatever becomes of it is counted once, and also that nobody waited for it any more.
+struct Count {
+    arrived: Instant,
+    caller: Caller,
+    model: String,
+    is_told: bool,
+}
+
+impl Count {
+    fn told(mut self, result: Result<Acted, ServiceError>) -> Result<Acted, ServiceError> {
+        self.is_told = true;
+        self.count(result.as_ref().map_or_else(ServiceError::reason, |_| "OK"));
+        match &result {
+            Ok(acted) => self.answered(acted),
+            Err(error) => {
+                if error.committed_step().is_some() {
+                    metrics::counter!("ada_step_conflicts_total", "reason" => error.reason()).increment(1);
+                }
+                if matches!(error, ServiceError::QueueFull { .. } | ServiceError::Deadline { stage: Stage::Admission | Stage::Queue }) {
+                    metrics::counter!("ada_shed_total", "reason" => error.reason()).increment(1);
+                }
+                tracing::debug!(reason = error.reason(), %error, "act refused");
             }
         }
-        Err(error) => {
-            if error.committed_step().is_some() {
-                metrics::counter!("ada_step_conflicts_total", "reason" => error.reason()).increment(1);
-            }
-            tracing::debug!(reason = error.reason(), %error, "act refused");
+        result
+    }
+
+    fn answered(&self, Acted { answer, replayed, .. }: &Acted) {
+        metrics::histogram!("ada_act_duration_seconds", "model" => self.model.clone()).record(self.arrived.elapsed().as_secs_f64());
+        if !replayed {
+            let Answer { chunk, timings, .. } = &**answer;
+            metrics::histogram!("ada_act_queue_seconds").record(timings.queue.as_secs_f64());
+            metrics::histogram!("ada_act_compute_seconds").record(timings.compute.as_secs_f64());
+            metrics::histogram!("ada_act_commit_seconds").record(timings.commit.as_secs_f64());
+            metrics::histogram!("ada_act_network_evaluations").record(f64::from(chunk.evaluations));
+        }
+    }
+
+    fn count(&self, code: &'static str) {
+        let (model, face) = (self.model.clone(), self.caller.face.word());
+        metrics::counter!("ada_acts_total", "model" => model, "face" => face, "code" => code).increment(1);
+    }
+}
+
+impl Drop for Count {
+    fn drop(&mut self) {
+        if !self.is_told {
+            self.count("CANCELLED");
         }
     }
 }

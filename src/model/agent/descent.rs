@@ -91,6 +91,13 @@ impl Descent {
         self.evaluations
     }
 
+    /// Evaluations that its ladder still asks for; of one that has not started those of a warm start, if there may be one.
+    pub fn evaluations_left(&self) -> usize {
+        let stored = self.stored_window().filter(|_| !self.started).map(|window| window.row);
+        let others = self.actions_left().saturating_sub(1) * self.ladder.rung();
+        self.ladder.emit().saturating_sub(stored.unwrap_or(self.row)) + others
+    }
+
     /// Resident size in bytes, beside its own: the copy of the episode, and the working memory.
     pub fn size_bytes(&self) -> usize {
         let floats = [&self.state, &self.x, &self.x0, &self.anchor, &self.emitted, &self.predicted_state, &self.eps];

@@ -136,6 +136,9 @@ pub struct EngineConfig {
     /// The queue serves the earliest deadline first, and nobody's as if it were later than this: who is patient does not wait behind all who come later
     /// and are in a hurry.
     pub turn_ms_max: u64,
+    /// An act that would wait for longer is refused (QUEUE_FULL), but for a slow model's, which may wait for twice as long as it takes. A queue that
+    /// is longer than its clients are patient answers nobody in time.
+    pub wait_ms_max: u64,
     /// Acts that share one network evaluation of a worker.
     pub batch_len_max: usize,
     /// Whether an act with `deadline_ms` takes larger jumps, or gives out the current window, when it would come too late
@@ -252,6 +255,7 @@ impl Default for EngineConfig {
             queue_len_max: 1024,
             queue_bytes_max: 64 << 20,
             turn_ms_max: 200,
+            wait_ms_max: 300,
             batch_len_max: 32,
             anytime: true,
             deadline_margin_ms: 1,
@@ -384,7 +388,7 @@ impl Config {
     }
 
     /// Settings that make no sense as 0.
-    fn positive(&self) -> [(&'static str, u64); 27] {
+    fn positive(&self) -> [(&'static str, u64); 28] {
         let (connection, limits, sessions, engine) = (&self.connection, &self.limits, &self.sessions, &self.engine);
         [
             ("server.connections_max", self.server.connections_max as u64),
@@ -411,6 +415,7 @@ impl Config {
             ("sessions.reap_interval_ms", sessions.reap_interval_ms),
             ("engine.queue_len_max", engine.queue_len_max as u64),
             ("engine.queue_bytes_max", engine.queue_bytes_max as u64),
+            ("engine.wait_ms_max", engine.wait_ms_max),
             ("engine.batch_len_max", engine.batch_len_max as u64),
             ("engine.retry_after_ms", engine.retry_after_ms),
             ("engine.heartbeat_age_ms_max", engine.heartbeat_age_ms_max),

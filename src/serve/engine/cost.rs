@@ -1,7 +1,11 @@
 //! What a tick costs: measured at warm-up for every batch length, so that an act with a deadline can be told how many it may still take.
 
 use crate::model::agent::{Agent, AgentError, Descent, Observation};
-use std::time::{Duration, Instant};
+use parking_lot::RwLock;
+use std::{
+    sync::{Arc, Weak},
+    time::{Duration, Instant},
+};
 
 /// Descents of each length that are timed, and their ticks; the fastest counts, for the first ones find no memory yet.
 const ROUNDS: usize = 3;
@@ -11,6 +15,24 @@ const LONG: Duration = Duration::from_millis(20);
 const NEWEST: f64 = 0.1;
 /// One tick counts as no slower than this: a hiccup of the machine is no reason to hurry for long.
 const SLOWEST: f64 = 4.0;
+
+/// The costs of every model, as the worker that measured it last found them.
+#[derive(Debug, Default)]
+pub(super) struct Tariff(RwLock<Vec<(Weak<Agent>, Arc<Costs>)>>);
+
+impl Tariff {
+    /// Takes note of what was measured; models that are gone are forgotten.
+    pub fn note(&self, agent: &Arc<Agent>, costs: Costs) {
+        let mut known = self.0.write();
+        known.retain(|(known, _)| known.strong_count() > 0 && known.as_ptr() != Arc::as_ptr(agent));
+        known.push((Arc::downgrade(agent), Arc::new(costs)));
+    }
+
+    /// Costs of a model; None: it was never measured.
+    pub fn of(&self, agent: &Arc<Agent>) -> Option<Arc<Costs>> {
+        self.0.read().iter().find(|(known, _)| known.as_ptr() == Arc::as_ptr(agent)).map(|(_, costs)| costs.clone())
+    }
+}
 
 /// Costs of one model on one worker.
 #[derive(Debug)]
@@ -48,6 +70,17 @@ impl Costs {
     /// A tick of `len` descents, with the start of `fresh` among them.
     pub fn tick(&self, len: usize, fresh: usize) -> Duration {
         of(&self.ticks, len) + if fresh > 0 { of(&self.starts, fresh) } else { Duration::ZERO }
+    }
+
+    /// A whole act of so many evaluations in a batch of `len`.
+    pub fn act(&self, evaluations: usize, len: usize) -> Duration {
+        self.tick(len, 0) * u32::try_from(evaluations).unwrap_or(u32::MAX) + of(&self.starts, len)
+    }
+
+    /// What of a worker's time an act of so many evaluations takes when its batch is full.
+    pub fn share(&self, evaluations: usize) -> Duration {
+        let len = self.ticks.len().max(1);
+        self.act(evaluations, len) / len as u32
     }
 
     /// Ticks of `len` descents that fit into `left` for one that has started or not, if each waits for `others` too and everything takes
@@ -127,6 +160,8 @@ mod tests {
         assert_eq!(within(10, 7, true, 0, 1.0), 3, "the longest that was measured");
         assert_eq!(within(3, 1, false, 0, 1.0), 0);
         assert_eq!(costs.tick(2, 1), ms(7));
+        assert_eq!((costs.act(3, 1), costs.act(3, 9)), (ms(10), ms(14)));
+        assert_eq!(costs.share(3), ms(7), "of a full batch");
     }
 
     #[test]

@@ -2,8 +2,9 @@
 //!
 //! An act waits in the bounded `queue`, the earliest deadline first; a `worker` takes it into its batch; each `tick` is one evaluation shared by all
 //! acts of the batch, whatever rung each stands on. Acts join and leave between ticks, so nobody waits for another's ladder to end. An act whose
-//! client named a deadline takes larger jumps when the `cost` of ticks says that it would come too late. The engine knows neither sessions nor
-//! clients: it gives each outcome to a ticket.
+//! client named a deadline takes larger jumps when the `cost` of ticks says that it would come too late; one that would come too late all the same,
+//! or wait for longer than acts may, is refused when it comes, and one that turns out to be late is dropped before it is computed. The engine knows
+//! neither sessions nor connections: it gives each outcome to a ticket.
 
 mod cost;
 mod queue;
@@ -12,7 +13,8 @@ mod worker;
 
 use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode, Observation};
 use parking_lot::Mutex;
-use queue::{Bounds, Place, Queue};
+use cost::Tariff;
+use queue::{Ask, Bounds, Place, Queue};
 use std::{
     sync::{
         Arc, Weak,
@@ -31,11 +33,27 @@ pub trait Ticket: Send + 'static {
     fn is_wanted(&self) -> bool;
     /// It has left the queue.
     fn start(&self);
-    /// When its answer is late, if everyone who waits prefers a coarser one in time: the act may be degraded. Asked between network
-    /// evaluations.
-    fn due(&self) -> Option<Instant>;
+    /// How long those who wait do so, together. Asked between network evaluations.
+    fn patience(&self) -> Patience;
     /// It is over.
     fn settle(self, outcome: Result<Finished, Failure>);
+}
+
+/// How long somebody waits for an act; None: for as long as it takes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Patience {
+    /// When a coarser answer is better than a later one: the act may be degraded.
+    pub due: Option<Instant>,
+    /// When nobody waits any more.
+    pub ends: Option<Instant>,
+}
+
+impl Patience {
+    /// Of two who wait for the same act the more patient one decides.
+    pub fn most(self, other: Self) -> Self {
+        let later = |a: Option<Instant>, b: Option<Instant>| Some(a?.max(b?));
+        Self { due: later(self.due, other.due), ends: later(self.ends, other.ends) }
+    }
 }
 
 /// What an act is computed from.
@@ -70,6 +88,8 @@ pub struct Job<T> {
     pub submitted: Instant,
     /// When it should have had its turn: the queue's order.
     pub turn_by: Instant,
+    /// Who asks: acts of one client wait behind one another.
+    pub client: u64,
 }
 
 /// An act computed.
@@ -94,6 +114,10 @@ pub enum Failure {
     Agent(AgentError),
     /// The model panicked over this act (tried again alone).
     Panic,
+    /// When it had its turn, it would have come too late.
+    Late,
+    /// It was the last one in a full queue, and another came before it.
+    Displaced,
     /// The engine ended before.
     Stopped,
 }
@@ -130,7 +154,12 @@ pub struct EngineOptions {
     pub batch_len_max: usize,
     /// Time kept for what follows the last evaluation of an act in a hurry: commit and answer.
     pub deadline_margin: Duration,
+    /// An act that would wait for longer is refused, but for one that itself takes longer.
+    pub wait_max: Duration,
 }
+
+/// A slow act may wait for as many times as long as it takes in a full batch, whatever `wait_max` says.
+const WAIT_ACTS: u32 = 2;
 
 /// A model to get ready for, and whom to tell.
 type WarmUp = (Arc<Agent>, mpsc::Sender<Result<(), Failure>>);
@@ -139,6 +168,7 @@ type WarmUp = (Arc<Agent>, mpsc::Sender<Result<(), Failure>>);
 struct Shared<T> {
     queue: Queue<Box<Job<T>>>,
     options: EngineOptions,
+    tariff: Tariff,
     /// For each worker; None after the end.
     warm_ups: Vec<Mutex<Option<Vec<WarmUp>>>>,
     epoch: Instant,
@@ -156,6 +186,7 @@ impl<T: Ticket> Engine<T> {
         let shared = Arc::new(Shared {
             queue: Queue::new(Bounds { len: options.queue_len_max, bytes: options.queue_bytes_max }, workers),
             options,
+            tariff: Tariff::default(),
             warm_ups: (0..workers).map(|_| Mutex::new(Some(Vec::new()))).collect(),
             epoch: Instant::now(),
             heartbeats: (0..workers).map(|_| AtomicU64::new(0)).collect(),
@@ -185,11 +216,22 @@ impl<T: Ticket> Engine<T> {
     /// Puts an act into the queue.
     ///
     /// # Errors
-    /// If the queue is full or the engine has ended; the job comes back.
+    /// If the queue is full, or the act would wait for too long, or the engine has ended; the job comes back.
     pub fn submit(&self, job: Job<T>) -> Result<Waiting<T>, (Refusal, Box<Job<T>>)> {
-        let (turn_by, bytes) = (job.turn_by, size_of::<Job<T>>() + job.question.observation.size_bytes() + job.descent.size_bytes());
-        let place = self.shared.queue.push(Box::new(job), turn_by, bytes)?;
+        let (job, ask) = match self.shared.ask(&job) {
+            Some(ask) => (Box::new(job), ask),
+            None => return Err((Refusal::Late, Box::new(job))),
+        };
+        let (place, displaced) = self.shared.queue.push(job, ask)?;
+        if let Some(displaced) = displaced {
+            displaced.ticket.settle(Err(Failure::Displaced));
+        }
         Ok(Waiting { shared: Arc::downgrade(&self.shared), place })
+    }
+
+    /// How long an act that comes now and has its turn last would wait.
+    pub fn expected_wait(&self) -> Duration {
+        self.shared.queue.expected_wait().0
     }
 
     /// Acts that wait, and acts in batches.
@@ -224,6 +266,34 @@ impl<T: Ticket> Engine<T> {
 impl<T: Ticket> Drop for Engine<T> {
     fn drop(&mut self) {
         self.stop(Duration::ZERO);
+    }
+}
+
+impl<T: Ticket> Shared<T> {
+    /// What an act asks of the queue; None: it would come too late without any wait. Of a model that was never measured nothing is known.
+    fn ask(&self, job: &Job<T>) -> Option<Ask> {
+        let bytes = size_of::<Job<T>>() + job.question.observation.size_bytes() + job.descent.size_bytes();
+        let ask = Ask {
+            turn_by: job.turn_by,
+            client: job.client,
+            work: Duration::ZERO,
+            bytes,
+            wait_max: Duration::MAX,
+            useful: Duration::MAX,
+        };
+        let Some(costs) = self.tariff.of(&job.agent) else { return Some(ask) };
+        let (evaluations, patience) = (job.descent.evaluations_left(), job.ticket.patience());
+        let ((waiting, running), (_, slowness)) = (self.queue.load(), self.queue.expected_wait());
+        let batch = ((waiting + running) / self.options.workers + 1).min(self.options.batch_len_max);
+        // One that may be degraded needs time for a single evaluation.
+        let least = costs.act(if patience.due.is_some() { 1 } else { evaluations }, batch).mul_f64(slowness.max(1.0));
+        let left = patience.ends.map(|ends| ends.saturating_duration_since(Instant::now()));
+        Some(Ask {
+            work: costs.share(evaluations),
+            wait_max: self.options.wait_max.max(costs.act(evaluations, self.options.batch_len_max) * WAIT_ACTS),
+            useful: left.map_or(Some(Duration::MAX), |left| left.checked_sub(least))?,
+            ..ask
+        })
     }
 }
 

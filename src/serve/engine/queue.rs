@@ -1,19 +1,35 @@
-//! The bounded queue between callers and workers: earliest deadline first, shared evenly between workers.
+//! The bounded queue between callers and workers: earliest turn first, shared evenly between workers, and no longer than callers wait.
+//!
+//! An act is admitted by its expected wait: the work of all that have their turn before it, at the pace at which the workers were last seen to
+//! take work while others waited. Under twice the load that the workers can bear a queue that takes everyone would answer nobody in time: whoever
+//! has its turn has waited for so long that its client is about to leave. Each client's acts come one behind the other, so that one who asks for
+//! hundreds at once waits behind those who ask for one.
 
 use parking_lot::{Condvar, Mutex};
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, HashMap},
     time::{Duration, Instant},
 };
 
 /// How long an idle worker sleeps before it shows itself again.
 const IDLE_WAIT: Duration = Duration::from_millis(250);
+/// The pace is measured over so long a time and so many acts: a batch that begins together also ends together.
+const PACE_TIME: Duration = Duration::from_millis(100);
+const PACE_ACTS: usize = 64;
+/// Weight of the newest measurement.
+const NEWEST_PACE: f64 = 0.3;
+/// The pace is between these multiples of what warm-up promised.
+const PACES: (f64, f64) = (0.1, 10.0);
 
 /// Why a job was not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
     /// A bound is reached.
     Full,
+    /// It would wait for longer than acts may, by so much.
+    Slow(Duration),
+    /// Its answer would come too late for who asks.
+    Late,
     /// The engine has ended.
     Closed,
 }
@@ -26,9 +42,29 @@ pub(super) struct Bounds {
     pub bytes: usize,
 }
 
-/// Where a job waits: in order of deadlines, and among equal ones the first come first. A deadline is a point in time, so whoever waits
+/// What a job asks of the queue.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Ask {
+    /// When it should have its turn, if nothing else of its client waits.
+    pub turn_by: Instant,
+    /// Whose it is.
+    pub client: u64,
+    /// Of a worker's time.
+    pub work: Duration,
+    /// Memory.
+    pub bytes: usize,
+    /// It is not to wait for longer than others may.
+    pub wait_max: Duration,
+    /// If it waits for longer than this, it is of no use.
+    pub useful: Duration,
+}
+
+/// Where a job waits: in order of turns, and among equal ones the first come first. A turn is a point in time, so whoever waits
 /// comes to be the first of all: nobody starves.
 pub(super) type Place = (Instant, u64);
+
+/// What is taken in the place of another.
+pub(super) type Displaced<J> = Option<J>;
 
 /// See the module.
 pub(super) struct Queue<J> {
@@ -38,53 +74,156 @@ pub(super) struct Queue<J> {
 }
 
 struct Inner<J> {
-    /// Jobs with their memory.
-    jobs: BTreeMap<Place, (usize, J)>,
+    jobs: BTreeMap<Place, Waiting<J>>,
     bytes: usize,
+    /// Work of each client that waits.
+    clients: HashMap<u64, Duration>,
     arrivals: u64,
     /// Jobs in the batch of each worker.
     running: Vec<usize>,
+    pace: Pace,
     closed: bool,
 }
 
+struct Waiting<J> {
+    client: u64,
+    work: Duration,
+    bytes: usize,
+    job: J,
+}
+
+/// How long the queue takes for a piece of work, while there is always more.
+#[derive(Clone, Copy, Debug)]
+struct Pace {
+    /// Time for each unit of work.
+    now: f64,
+    /// What it is if all workers do nothing else.
+    promised: f64,
+    since: Option<Instant>,
+    acts: usize,
+    work: Duration,
+}
+
+impl Pace {
+    fn new(workers: usize) -> Self {
+        let promised = 1.0 / workers.max(1) as f64;
+        Self { now: promised, promised, since: None, acts: 0, work: Duration::ZERO }
+    }
+
+    fn wait(&self, work: Duration) -> Duration {
+        work.mul_f64(self.now)
+    }
+
+    /// So many acts were taken, and others still wait or not.
+    fn note(&mut self, acts: usize, work: Duration, more_wait: bool, now: Instant) {
+        let Some(since) = self.since.filter(|_| more_wait) else {
+            // What is taken at the beginning has waited before it.
+            *self = Self { since: more_wait.then_some(now), acts: 0, work: Duration::ZERO, ..*self };
+            return;
+        };
+        self.acts += acts;
+        self.work += work;
+        let took = now.saturating_duration_since(since);
+        if took < PACE_TIME || self.acts < PACE_ACTS {
+            return;
+        }
+        if !self.work.is_zero() {
+            let (least, most) = PACES;
+            let pace = (took.as_secs_f64() / self.work.as_secs_f64()).clamp(least * self.promised, most * self.promised);
+            self.now += NEWEST_PACE * (pace - self.now);
+        }
+        *self = Self { since: Some(now), acts: 0, work: Duration::ZERO, ..*self };
+    }
+}
+
 impl<J> Inner<J> {
-    fn pop(&mut self) -> Option<J> {
-        let (_, (bytes, job)) = self.jobs.pop_first()?;
-        self.bytes -= bytes;
-        Some(job)
+    fn remove(&mut self, place: &Place) -> Option<Waiting<J>> {
+        let waiting = self.jobs.remove(place)?;
+        self.bytes -= waiting.bytes;
+        if let Some(work) = self.clients.get_mut(&waiting.client) {
+            *work = work.saturating_sub(waiting.work);
+            if work.is_zero() {
+                self.clients.remove(&waiting.client);
+            }
+        }
+        Some(waiting)
+    }
+
+    fn pop(&mut self) -> Option<Waiting<J>> {
+        let place = *self.jobs.first_key_value()?.0;
+        self.remove(&place)
+    }
+
+    /// Whether one who has its turn then is to wait for no longer than it may: counts only as much of the work before it as decides that.
+    fn admits(&self, turn: Instant, ask: &Ask) -> Result<(), Refusal> {
+        let wait_max = ask.wait_max.min(ask.useful);
+        let mut ahead = Duration::ZERO;
+        for (_, waiting) in self.jobs.range(..(turn, u64::MAX)) {
+            ahead += waiting.work;
+            let wait = self.pace.wait(ahead);
+            if wait > wait_max {
+                return Err(if ask.useful < ask.wait_max { Refusal::Late } else { Refusal::Slow(self.excess(wait_max)) });
+            }
+        }
+        Ok(())
+    }
+
+    /// By how much everyone who waits exceeds this time together.
+    fn excess(&self, wait_max: Duration) -> Duration {
+        let all: Duration = self.clients.values().sum();
+        self.pace.wait(all).saturating_sub(wait_max)
+    }
+
+    fn has_room(&self, bytes: usize, bounds: Bounds) -> bool {
+        self.jobs.len() < bounds.len && (self.jobs.is_empty() || self.bytes + bytes <= bounds.bytes)
     }
 }
 
 impl<J> Queue<J> {
     pub fn new(bounds: Bounds, workers: usize) -> Self {
-        let inner = Inner { jobs: BTreeMap::new(), bytes: 0, arrivals: 0, running: vec![0; workers], closed: false };
+        let inner = Inner {
+            jobs: BTreeMap::new(),
+            bytes: 0,
+            clients: HashMap::new(),
+            arrivals: 0,
+            running: vec![0; workers],
+            pace: Pace::new(workers),
+            closed: false,
+        };
         Self { inner: Mutex::new(inner), ready: Condvar::new(), bounds }
     }
 
-    /// Adds a job that takes `bytes` of memory; its place, to withdraw it. A refusal looks at two numbers and at no job.
-    pub fn push(&self, job: J, turn_by: Instant, bytes: usize) -> Result<Place, (Refusal, J)> {
+    /// Adds a job: its place, to withdraw it, and the job that had to leave for it. In a full queue the last one leaves, if its turn is behind
+    /// this one's: one client that fills the queue keeps nobody else out.
+    pub fn push(&self, job: J, ask: Ask) -> Result<(Place, Displaced<J>), (Refusal, J)> {
         let mut inner = self.inner.lock();
         if inner.closed {
             return Err((Refusal::Closed, job));
         }
-        let is_too_much = inner.bytes + bytes > self.bounds.bytes && !inner.jobs.is_empty();
-        if inner.jobs.len() >= self.bounds.len || is_too_much {
-            return Err((Refusal::Full, job));
+        let own = inner.clients.get(&ask.client).copied().unwrap_or(Duration::ZERO);
+        let turn = ask.turn_by + inner.pace.wait(own);
+        if let Err(refusal) = inner.admits(turn, &ask) {
+            return Err((refusal, job));
+        }
+        let mut displaced = None;
+        if !inner.has_room(ask.bytes, self.bounds) {
+            let last = inner.jobs.last_key_value().map(|(place, waiting)| (*place, waiting.bytes));
+            let makes_room = |(place, bytes): &(Place, usize)| place.0 > turn && inner.bytes - bytes + ask.bytes <= self.bounds.bytes;
+            let Some((place, _)) = last.filter(makes_room) else { return Err((Refusal::Full, job)) };
+            displaced = inner.remove(&place).map(|waiting| waiting.job);
         }
         inner.arrivals += 1;
-        inner.bytes += bytes;
-        let place = (turn_by, inner.arrivals);
-        inner.jobs.insert(place, (bytes, job));
+        inner.bytes += ask.bytes;
+        *inner.clients.entry(ask.client).or_default() += ask.work;
+        let place = (turn, inner.arrivals);
+        inner.jobs.insert(place, Waiting { client: ask.client, work: ask.work, bytes: ask.bytes, job });
         self.ready.notify_one();
-        Ok(place)
+        Ok((place, displaced))
     }
 
     /// Takes a job back, if it still waits.
     pub fn withdraw(&self, place: Place) -> Option<J> {
-        let mut inner = self.inner.lock();
-        let (bytes, job) = inner.jobs.remove(&place)?;
-        inner.bytes -= bytes;
-        Some(job)
+        self.inner.lock().remove(&place).map(|waiting| waiting.job)
     }
 
     /// Jobs for a worker that holds `held` jobs now and has `room` for more; None: the end. Waits only if it holds none.
@@ -104,7 +243,10 @@ impl<J> Queue<J> {
         if inner.jobs.len() > count {
             self.ready.notify_one();
         }
-        Some(std::iter::from_fn(|| inner.pop()).take(count).collect())
+        let taken: Vec<_> = std::iter::from_fn(|| inner.pop()).take(count).collect();
+        let (work, more_wait) = (taken.iter().map(|waiting| waiting.work).sum(), !inner.jobs.is_empty());
+        inner.pace.note(count, work, more_wait, Instant::now());
+        Some(taken.into_iter().map(|waiting| waiting.job).collect())
     }
 
     /// Whether it has ended.
@@ -123,92 +265,21 @@ impl<J> Queue<J> {
         (inner.jobs.len(), inner.running.iter().sum())
     }
 
+    /// How long one who comes now and has its turn last would wait, and how many times slower work is than warm-up promised.
+    pub fn expected_wait(&self) -> (Duration, f64) {
+        let inner = self.inner.lock();
+        (inner.excess(Duration::ZERO), inner.pace.now / inner.pace.promised)
+    }
+
     /// Ends the queue and gives back what waits in it.
     pub fn close(&self) -> Vec<J> {
         let mut inner = self.inner.lock();
         inner.closed = true;
         self.ready.notify_all();
-        std::iter::from_fn(|| inner.pop()).collect()
+        std::iter::from_fn(|| inner.pop()).map(|waiting| waiting.job).collect()
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn queue(len: usize, workers: usize) -> Queue<i32> {
-        Queue::new(Bounds { len, bytes: 100 }, workers)
-    }
-
-    #[test]
-    fn bounded_and_left_at_once() {
-        let (queue, now) = (queue(2, 1), Instant::now());
-        let first = queue.push(1, now, 1).unwrap();
-        assert!(queue.push(2, now, 1).is_ok());
-        assert_eq!(queue.push(3, now, 1), Err((Refusal::Full, 3)));
-        assert_eq!((queue.withdraw(first), queue.withdraw(first)), (Some(1), None));
-        assert!(queue.push(3, now, 1).is_ok(), "who leaves makes room");
-        assert_eq!(queue.push(4, now, 1), Err((Refusal::Full, 4)));
-        assert_eq!(queue.take(0, 0, 8), Some(vec![2, 3]));
-        assert_eq!(queue.load(), (0, 2));
-        assert_eq!(queue.take(0, 1, 8), Some(vec![]), "does not wait while it holds one");
-        assert_eq!(queue.load(), (0, 1));
-        assert_eq!(queue.close(), Vec::<i32>::new());
-        assert_eq!(queue.push(5, now, 1), Err((Refusal::Closed, 5)));
-        assert_eq!(queue.take(0, 0, 8), None);
-    }
-
-    /// An act may be told of thousands of steps: what waits is bounded in bytes too, but whatever fits into a message has its turn alone.
-    #[test]
-    fn bounded_in_bytes() {
-        let (queue, now) = (queue(9, 1), Instant::now());
-        let large = queue.push(1, now, 1000).unwrap();
-        assert_eq!(queue.push(2, now, 1), Err((Refusal::Full, 2)));
-        queue.withdraw(large);
-        assert!(queue.push(3, now, 60).is_ok() && queue.push(4, now, 40).is_ok());
-        assert_eq!(queue.push(5, now, 1), Err((Refusal::Full, 5)));
-        assert_eq!(queue.take(0, 0, 1), Some(vec![3]));
-        assert!(queue.push(6, now, 60).is_ok());
-        assert_eq!(queue.close(), [4, 6]);
-    }
-
-    #[test]
-    fn workers_share() {
-        let (queue, now) = (queue(16, 2), Instant::now());
-        for job in 0..5 {
-            queue.push(job, now, 1).unwrap();
-        }
-        assert_eq!(queue.take(0, 0, 8).unwrap().len(), 3);
-        assert_eq!(queue.take(1, 0, 8).unwrap().len(), 2);
-        for job in 0..9 {
-            queue.push(job, now, 1).unwrap();
-        }
-        assert_eq!(queue.take(0, 2, 1).unwrap().len(), 1, "no more than there is room");
-        assert_eq!(queue.load(), (8, 5));
-        queue.take(0, 0, 0);
-        assert_eq!(queue.load(), (8, 2), "a worker that holds nothing any more, for whatever reason, runs nothing");
-    }
-
-    /// The earliest deadline first; and with a stream of acts that are always more urgent when they come, an old one still gets its turn
-    /// as soon as its own deadline is the earliest.
-    #[test]
-    fn earliest_deadline_first_and_nobody_starves() {
-        let (queue, now) = (queue(64, 1), Instant::now());
-        let at = |ms| now + Duration::from_millis(ms);
-        for (job, ms) in [(1, 30), (2, 10), (3, 20), (4, 10)] {
-            queue.push(job, at(ms), 1).unwrap();
-        }
-        assert_eq!(queue.take(0, 0, 3), Some(vec![2, 4, 3]));
-        assert_eq!(queue.take(0, 0, 3), Some(vec![1]));
-        queue.push(0, at(100), 1).unwrap();
-        let mut turns = 0;
-        for arrival in 1.. {
-            queue.push(arrival, at(arrival as u64 * 10 + 5), 1).unwrap();
-            turns += 1;
-            if queue.take(0, 0, 1).unwrap() == [0] {
-                break;
-            }
-        }
-        assert_eq!(turns, 10);
-    }
-}
+#[path = "queue_tests.rs"]
+mod tests;

@@ -1,13 +1,13 @@
 //! A worker's batch and its tick: one network evaluation shared by all acts that use the same model.
 
 use super::{
-    EngineOptions, Failure, Finished, Job, Question, Ticket,
-    cost::{Costs, Slowness},
+    EngineOptions, Failure, Finished, Job, Patience, Question, Ticket,
+    cost::{Costs, Slowness, Tariff},
 };
 use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode};
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
-    sync::{Arc, Weak},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -15,8 +15,6 @@ use std::{
 pub(super) struct Batch<T> {
     options: EngineOptions,
     groups: Vec<Group<T>>,
-    /// What this worker has measured.
-    costs: Vec<(Weak<Agent>, Arc<Costs>)>,
     slowness: Slowness,
 }
 
@@ -38,6 +36,16 @@ struct Pace {
     margin: Duration,
 }
 
+/// What becomes of an act before the next tick.
+enum Hurry {
+    /// It takes part.
+    Goes,
+    /// It gave out what it had.
+    Cut,
+    /// Its answer would come too late.
+    Late,
+}
+
 struct Rider<T> {
     question: Question,
     ticket: T,
@@ -47,7 +55,7 @@ struct Rider<T> {
 
 impl<T: Ticket> Batch<T> {
     pub fn new(options: EngineOptions) -> Self {
-        Self { options, groups: Vec::new(), costs: Vec::new(), slowness: Slowness::default() }
+        Self { options, groups: Vec::new(), slowness: Slowness::default() }
     }
 
     /// Acts in it.
@@ -56,21 +64,26 @@ impl<T: Ticket> Batch<T> {
     }
 
     /// Gets ready for a model; see [`Costs::measure`].
-    pub fn warm_up(&mut self, agent: &Arc<Agent>, go_on: impl FnMut() -> bool) -> Result<(), Failure> {
-        let costs = guarded(|| Costs::measure(agent, self.options.batch_len_max, go_on))?;
-        self.costs.retain(|(known, _)| known.strong_count() > 0);
-        self.costs.push((Arc::downgrade(agent), Arc::new(costs)));
+    pub fn warm_up(&self, agent: &Arc<Agent>, tariff: &Tariff, go_on: impl FnMut() -> bool) -> Result<(), Failure> {
+        tariff.note(agent, guarded(|| Costs::measure(agent, self.options.batch_len_max, go_on))?);
         Ok(())
     }
 
-    /// Takes an act in; it takes part from the next tick on.
-    pub fn admit(&mut self, job: Job<T>) {
-        let Job { agent, question, descent, ticket, submitted, turn_by: _ } = job;
+    /// Takes an act into a batch that will have this length; it takes part from the next tick on. One that would come too late is not begun.
+    pub fn admit(&mut self, job: Job<T>, len: usize, tariff: &Tariff) {
+        let Job { agent, question, descent, ticket, submitted, turn_by: _, client: _ } = job;
         if !ticket.is_wanted() {
             return;
         }
+        let (slowness, margin) = (self.slowness.get(), self.options.deadline_margin);
+        let group = self.group(agent, tariff);
+        if let Some(costs) = &group.costs {
+            let needs = costs.act(descent.evaluations_left(), len).mul_f64(slowness);
+            if is_late(ticket.patience(), needs, margin) {
+                return ticket.settle(Err(Failure::Late));
+            }
+        }
         ticket.start();
-        let group = self.group(agent);
         group.descents.push(descent);
         group.riders.push(Rider { question, ticket, submitted, started: Instant::now() });
     }
@@ -89,6 +102,7 @@ impl<T: Ticket> Batch<T> {
     /// Drops all acts, half done as they are; their tickets know what to do. What was measured stays.
     pub fn abandon(&mut self) {
         for group in self.groups.drain(..) {
+            group.descents.iter().for_each(count_waste);
             for rider in group.riders {
                 // The one that panicked may do so again when it is dropped.
                 drop(catch_unwind(AssertUnwindSafe(|| drop(rider))));
@@ -98,15 +112,16 @@ impl<T: Ticket> Batch<T> {
 
     /// The end: whoever is left fails.
     pub fn stop(self) {
-        let riders = self.groups.into_iter().flat_map(|group| group.riders);
-        riders.for_each(|rider| rider.ticket.settle(Err(Failure::Stopped)));
+        for group in self.groups {
+            group.descents.iter().for_each(count_waste);
+            group.riders.into_iter().for_each(|rider| rider.ticket.settle(Err(Failure::Stopped)));
+        }
     }
 
-    fn group(&mut self, agent: Arc<Agent>) -> &mut Group<T> {
+    fn group(&mut self, agent: Arc<Agent>, tariff: &Tariff) -> &mut Group<T> {
         let index = self.groups.iter().position(|group| Arc::ptr_eq(&group.agent, &agent));
         let index = index.unwrap_or_else(|| {
-            let costs = self.costs.iter().find(|(known, _)| known.as_ptr() == Arc::as_ptr(&agent));
-            let costs = costs.map(|(_, costs)| costs.clone());
+            let costs = tariff.of(&agent);
             self.groups.push(Group { agent, costs, descents: Vec::new(), riders: Vec::new() });
             self.groups.len() - 1
         });
@@ -122,12 +137,10 @@ impl<T: Ticket> Group<T> {
         if self.riders.is_empty() {
             return;
         }
-        metrics::counter!("ada_batches_total").increment(1);
-        metrics::histogram!("ada_batch_size").record(self.riders.len() as f64);
         let (begin, expected) = (Instant::now(), self.expected());
-        if guarded(|| self.agent.advance(&mut self.descents)).is_err() {
+        if advance(&self.agent, &mut self.descents).is_err() {
             // Whose fault it was is unknown, and the descents may be half advanced: each act starts again, alone.
-            self.descents.clear();
+            self.descents.drain(..).for_each(|descent| count_waste(&descent));
             for rider in self.riders.drain(..) {
                 rider.ride_alone(&self.agent, self.costs.as_deref(), pace);
             }
@@ -151,10 +164,14 @@ impl<T: Ticket> Group<T> {
         for i in (0..self.riders.len()).rev() {
             let batch = (costs.as_ref(), self.riders.len(), slowness.get());
             match self.riders[i].hurry(&self.agent, &mut self.descents[i], batch, pace) {
-                Ok(true) => slowness.forget(),
-                Ok(false) => {}
+                Ok(Hurry::Cut) => slowness.forget(),
+                Ok(Hurry::Goes) => {}
+                Ok(Hurry::Late) => {
+                    count_waste(&self.descents.swap_remove(i));
+                    self.riders.swap_remove(i).ticket.settle(Err(Failure::Late));
+                }
                 Err(_) => {
-                    self.descents.swap_remove(i);
+                    count_waste(&self.descents.swap_remove(i));
                     self.riders.swap_remove(i).ride_alone(&self.agent, None, pace);
                 }
             }
@@ -174,28 +191,29 @@ impl<T: Ticket> Group<T> {
         for i in (0..self.riders.len()).rev() {
             if self.descents[i].is_done() {
                 let descent = self.descents.swap_remove(i);
-                let finished = guarded(|| self.agent.finish(descent));
-                self.riders.swap_remove(i).settle(finished);
+                self.riders.swap_remove(i).settle(finish(&self.agent, descent));
             }
         }
     }
 }
 
 impl<T: Ticket> Rider<T> {
-    /// See [`Group::hurry`]; the batch is its costs, length and slowness. Says whether the act was cut short.
-    fn hurry(&self, agent: &Agent, descent: &mut Descent, batch: (&Costs, usize, f64), pace: Pace) -> Result<bool, Failure> {
-        let Some(due) = self.ticket.due() else {
+    /// See [`Group::hurry`]; the batch is its costs, length and slowness.
+    fn hurry(&self, agent: &Agent, descent: &mut Descent, batch: (&Costs, usize, f64), pace: Pace) -> Result<Hurry, Failure> {
+        let (patience, (costs, len, slowness)) = (self.ticket.patience(), batch);
+        let Some(due) = patience.due else {
             descent.allow(None);
-            return Ok(false);
+            // In the best case; what was computed already is lost with it.
+            let needs = costs.tick(len, 0) * descent.evaluations_left() as u32;
+            return Ok(if is_late(patience, needs, Duration::ZERO) { Hurry::Late } else { Hurry::Goes });
         };
-        let (costs, len, slowness) = batch;
         let left = due.saturating_duration_since(Instant::now()).saturating_sub(pace.margin);
         let ticks = costs.ticks_within(left, (len, descent.evaluations() > 0), pace.others, slowness);
         if ticks == 0 && guarded(|| Ok(agent.cut_short(descent)))? {
-            return Ok(true);
+            return Ok(Hurry::Cut);
         }
         descent.allow(Some(ticks));
-        Ok(false)
+        Ok(Hurry::Goes)
     }
 
     /// The whole act without batch mates, from the beginning: the result is the same, for noise does not depend on the batch.
@@ -208,13 +226,18 @@ impl<T: Ticket> Rider<T> {
             if !self.ticket.is_wanted() {
                 return count_waste(&descent);
             }
-            let hurried = costs.map_or(Ok(false), |costs| self.hurry(agent, &mut descent, (costs, 1, 1.0), pace));
-            let advanced = hurried.and_then(|cut| if cut { Ok(()) } else { guarded(|| agent.advance(std::slice::from_mut(&mut descent))) });
+            let hurried = costs.map_or(Ok(Hurry::Goes), |costs| self.hurry(agent, &mut descent, (costs, 1, 1.0), pace));
+            let advanced = hurried.and_then(|hurry| match hurry {
+                Hurry::Goes => advance(agent, std::slice::from_mut(&mut descent)),
+                Hurry::Cut => Ok(()),
+                Hurry::Late => Err(Failure::Late),
+            });
             if let Err(failure) = advanced {
+                count_waste(&descent);
                 return self.ticket.settle(Err(failure));
             }
         }
-        self.settle(guarded(|| agent.finish(descent)));
+        self.settle(finish(agent, descent));
     }
 
     fn settle(self, finished: Result<(Episode, Chunk), Failure>) {
@@ -227,8 +250,30 @@ impl<T: Ticket> Rider<T> {
     }
 }
 
+/// One evaluation of a batch. Every evaluation is counted here, and once more where it ends: with an act that was computed, or as waste.
+fn advance(agent: &Agent, descents: &mut [Descent]) -> Result<(), Failure> {
+    guarded(|| agent.advance(descents))?;
+    metrics::counter!("ada_batches_total").increment(1);
+    metrics::histogram!("ada_batch_size").record(descents.len() as f64);
+    Ok(())
+}
+
+fn finish(agent: &Agent, descent: Descent) -> Result<(Episode, Chunk), Failure> {
+    let evaluations = descent.evaluations();
+    guarded(|| agent.finish(descent)).inspect_err(|_| waste(evaluations))
+}
+
 fn count_waste(descent: &Descent) {
-    metrics::counter!("ada_wasted_network_evaluations_total").increment(descent.evaluations().into());
+    waste(descent.evaluations());
+}
+
+fn waste(evaluations: u32) {
+    metrics::counter!("ada_wasted_network_evaluations_total").increment(evaluations.into());
+}
+
+/// Whether nobody will wait for an answer that takes so much more time.
+fn is_late(patience: Patience, needs: Duration, margin: Duration) -> bool {
+    patience.due.is_none() && patience.ends.is_some_and(|ends| Instant::now() + needs + margin > ends)
 }
 
 /// Runs a piece of the model; a panic is a failure of the act, not of the thread. What it touched is dropped, so no broken state is seen again.

@@ -40,12 +40,19 @@ fn run<T: Ticket>(shared: &Shared<T>, index: usize, batch: &mut Batch<T>) {
                 !shared.queue.is_closed()
             };
             // Whoever asked may have gone meanwhile.
-            let _gone = done.send(batch.warm_up(&agent, go_on));
+            let _gone = done.send(batch.warm_up(&agent, &shared.tariff, go_on));
         }
-        let held = batch.len();
-        let Some(arrivals) = shared.queue.take(index, held, shared.options.batch_len_max.saturating_sub(held)) else { return };
-        for job in arrivals {
-            batch.admit(*job);
+        loop {
+            let held = batch.len();
+            let Some(arrivals) = shared.queue.take(index, held, shared.options.batch_len_max.saturating_sub(held)) else { return };
+            let full = held + arrivals.len();
+            for job in arrivals {
+                batch.admit(*job, full, &shared.tariff);
+            }
+            // The place of one that came too late is the next one's.
+            if batch.len() == full {
+                break;
+            }
         }
         batch.tick();
     }

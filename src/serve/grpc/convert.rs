@@ -9,7 +9,7 @@ use crate::{
     serve::{
         error::ServiceError,
         registry::Model,
-        request::{ActRequest, ActResult, Acted, Face, ListRequest, OpenRequest, OptionsPatch, ResetRequest},
+        request::{ActRequest, ActResult, Acted, Caller, Face, ListRequest, OpenRequest, OptionsPatch, ResetRequest},
         session::{Answer, Summary, Timings},
     },
 };
@@ -45,13 +45,14 @@ fn latent_mode(mode: i32) -> Checked<LatentMode> {
 }
 
 /// `timeout`: the call's own.
-pub fn act_request(request: pb::ActRequest, timeout: Option<Duration>) -> Result<ActRequest, ActResult> {
+pub fn act_request(request: pb::ActRequest, timeout: Option<Duration>, client: u64) -> Result<ActRequest, ActResult> {
     let pb::ActRequest { session_id, step, observation, deadline_ms, want_planned_states, episode } = request;
     let deadline = deadline_ms.map(|ms| Duration::from_millis(ms.into()));
     match observation {
         Some(observation) => {
             let observation = self::observation(observation);
-            Ok(ActRequest { session_id, step, episode, observation, deadline, timeout, want_planned_states, face: Face::Grpc })
+            let caller = Caller { face: Face::Grpc, client };
+            Ok(ActRequest { session_id, step, episode, observation, deadline, timeout, want_planned_states, caller })
         }
         None => {
             let result = Err(ServiceError::invalid("observation", "is missing"));

@@ -13,6 +13,7 @@ pub mod pb {
 
 use crate::serve::{
     error::{ServiceError, Stage},
+    listener::Gate,
     request::ActResult,
     service::Service,
 };
@@ -101,6 +102,11 @@ fn timeout(metadata: &MetadataMap) -> Option<Duration> {
     }
 }
 
+/// The connection that a request came by.
+fn client<T>(request: &Request<T>) -> u64 {
+    request.extensions().get::<Gate>().map_or(0, Gate::client)
+}
+
 #[tonic::async_trait]
 impl agent_server::Agent for Face {
     type ActStreamStream = Pin<Box<dyn Stream<Item = Result<pb::ActResult, Status>> + Send>>;
@@ -112,8 +118,8 @@ impl agent_server::Agent for Face {
     }
 
     async fn act(&self, request: Request<pb::ActRequest>) -> Answer<pb::ActResponse> {
-        let timeout = timeout(request.metadata());
-        let result = match convert::act_request(request.into_inner(), timeout) {
+        let (timeout, client) = (timeout(request.metadata()), client(&request));
+        let result = match convert::act_request(request.into_inner(), timeout, client) {
             Ok(act) => self.0.act(act).await,
             Err(misread) => misread.result,
         };
@@ -122,10 +128,10 @@ impl agent_server::Agent for Face {
 
     async fn act_stream(&self, request: Request<Streaming<pb::ActRequest>>) -> Answer<Self::ActStreamStream> {
         self.0.accepts().map_err(refuse)?;
-        let timeout = timeout(request.metadata());
+        let (timeout, client) = (timeout(request.metadata()), client(&request));
         let limit = self.0.config().limits.message_bytes_max;
         let acts = request.into_inner().map(move |act| match act {
-            Ok(act) => convert::act_request(act, timeout),
+            Ok(act) => convert::act_request(act, timeout, client),
             Err(status) => Err(ActResult { session_id: String::new(), step: 0, result: Err(unreadable(status.code(), limit)) }),
         });
         let results = self.0.clone().act_stream(acts).map(|result| Ok(convert::act_result(result)));
@@ -133,11 +139,11 @@ impl agent_server::Agent for Face {
     }
 
     async fn act_batch(&self, request: Request<pb::ActBatchRequest>) -> Answer<pb::ActBatchResponse> {
-        let timeout = timeout(request.metadata());
+        let (timeout, client) = (timeout(request.metadata()), client(&request));
         if timeout.is_some_and(|timeout| timeout.is_zero()) {
             return Err(refuse(ServiceError::Deadline { stage: Stage::Admission }));
         }
-        let acts = request.into_inner().acts.into_iter().map(|act| convert::act_request(act, timeout));
+        let acts = request.into_inner().acts.into_iter().map(|act| convert::act_request(act, timeout, client));
         let results = self.0.act_batch(acts.collect()).await.map_err(refuse)?;
         Ok(Response::new(pb::ActBatchResponse { results: results.into_iter().map(convert::act_result).collect() }))
     }

@@ -2,7 +2,7 @@
 
 use crate::{
     model::agent::{Executed, LatentMode, Observation, SamplerOptions},
-    serve::request::{ActRequest, Face, OpenRequest, OptionsPatch, ResetRequest},
+    serve::request::{ActRequest, Caller, Face, OpenRequest, OptionsPatch, ResetRequest},
 };
 use serde::{Deserialize, Deserializer, Serialize, de};
 use std::time::Duration;
@@ -179,7 +179,7 @@ impl From<OpenBody> for OpenRequest {
 
 impl ActBody {
     /// The act of this session.
-    pub fn into_request(self, session_id: String) -> ActRequest {
+    pub fn into_request(self, session_id: String, client: u64) -> ActRequest {
         let Self { session_id: _, step, observation, deadline_ms, want_planned_states, episode } = self;
         let ObservationBody { state, executed, nothing_executed } = observation;
         let step_of = |ExecutedBody { state, action, reward }| Executed { state, action, reward };
@@ -195,7 +195,7 @@ impl ActBody {
             deadline: deadline_ms.map(|ms| Duration::from_millis(ms.into())),
             timeout: None,
             want_planned_states: want_planned_states.unwrap_or(false),
-            face: Face::Http,
+            caller: Caller { face: Face::Http, client },
         }
     }
 }

@@ -174,12 +174,12 @@ async fn reset_session(Shared(state): Shared<State>, Named(id): Named, body: Bod
 /// Act
 #[utoipa::path(post, path = "/v1/sessions/{id}/act", params(("id" = String, Path)), request_body = ActBody,
     responses((status = 200, description = "The action chunk, and what is known about it", body = ActAnswer), Problem))]
-async fn act(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Answer<ActAnswer> {
+async fn act(Shared(state): Shared<State>, Named(id): Named, Extension(gate): Extension<Gate>, body: Body) -> Answer<ActAnswer> {
     let body: ActBody = read(body, &state).await?;
     if body.session_id.as_ref().is_some_and(|other| *other != id) {
         return Err(ServiceError::invalid("session_id", "differs from the path").into());
     }
-    Ok(Json((&state.service.act(body.into_request(id)).await?).into()))
+    Ok(Json((&state.service.act(body.into_request(id, gate.client())).await?).into()))
 }
 
 /// ActStream, a WebSocket: each text message is an act, each answer a result
@@ -200,11 +200,11 @@ async fn act_stream(
 
 /// ActBatch
 #[utoipa::path(post, path = "/v1/act:batch", request_body = BatchBody, responses((status = 200, description = "An answer or an error for each act, in their order", body = BatchAnswer), Problem))]
-async fn act_batch(Shared(state): Shared<State>, body: Body) -> Answer<BatchAnswer> {
+async fn act_batch(Shared(state): Shared<State>, Extension(gate): Extension<Gate>, body: Body) -> Answer<BatchAnswer> {
     let body: BatchBody = read(body, &state).await?;
     let acts = body.acts.into_iter().map(|mut act| {
         let session_id = act.session_id.take();
-        let act = act.into_request(session_id.clone().unwrap_or_default());
+        let act = act.into_request(session_id.clone().unwrap_or_default(), gate.client());
         let missing = || ServiceError::invalid("session_id", "is missing");
         if session_id.is_some() { Ok(act) } else { Err(ActResult { session_id: String::new(), step: act.step, result: Err(missing()) }) }
     });

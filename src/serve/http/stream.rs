@@ -15,7 +15,7 @@ pub async fn serve(socket: WebSocket, state: State, session_id: String, gate: Ga
     let (mut answers, messages) = socket.split();
     let left = CancellationToken::new();
     let leave = left.clone();
-    let acts = acts(messages, state.service.clone(), session_id).chain(stream::poll_fn(move |_| {
+    let acts = acts(messages, state.service.clone(), session_id, gate.client()).chain(stream::poll_fn(move |_| {
         leave.cancel();
         Poll::Ready(None)
     }));
@@ -40,11 +40,12 @@ fn acts(
     messages: impl Stream<Item = Result<Message, axum::Error>>,
     service: Arc<Service>,
     session_id: String,
+    client: u64,
 ) -> impl Stream<Item = Result<ActRequest, ActResult>> {
     let read = move |bytes: &[u8]| match parse::<ActBody>(bytes, service.config()) {
         Ok(mut body) => {
             let session_id = body.session_id.take().unwrap_or_else(|| session_id.clone());
-            Ok(body.into_request(session_id))
+            Ok(body.into_request(session_id, client))
         }
         Err(error) => Err(ActResult { session_id: session_id.clone(), step: 0, result: Err(error) }),
     };

@@ -1,6 +1,7 @@
 //! An act in flight and those who wait for it: it is computed as long as somebody waits, however many join or leave.
 
 use crate::serve::{
+    engine::Patience,
     error::{ServiceError, Stage},
     session::{Key, Outcome, Session},
 };
@@ -25,17 +26,18 @@ pub struct Flight {
     /// Nobody can join once this is 0: the flight is over.
     waiters: AtomicUsize,
     computing: AtomicBool,
-    /// For each of those who wait, by number, when its answer is late, if it prefers a coarser one in time.
-    dues: Mutex<Vec<(u64, Option<Instant>)>>,
+    /// Of each of those who wait, by number.
+    patience: Mutex<Vec<(u64, Patience)>>,
     outcome: watch::Sender<Option<Outcome>>,
     /// Takes the act out of the queue.
     leave: Mutex<Option<Box<dyn FnOnce() + Send>>>,
 }
 
 impl Flight {
-    pub(super) fn new(step: u64, key: Key, arrived: Instant, due: Option<Instant>) -> Arc<Self> {
+    pub(super) fn new(step: u64, key: Key, arrived: Instant, patience: Patience) -> Arc<Self> {
         let (waiters, computing, outcome) = (AtomicUsize::new(1), AtomicBool::new(false), watch::Sender::new(None));
-        Arc::new(Self { step, key, arrived, waiters, computing, dues: Mutex::new(vec![(0, due)]), outcome, leave: Mutex::new(None) })
+        let patience = Mutex::new(vec![(0, patience)]);
+        Arc::new(Self { step, key, arrived, waiters, computing, patience, outcome, leave: Mutex::new(None) })
     }
 
     /// Whether somebody waits and there is no outcome yet.
@@ -63,17 +65,17 @@ impl Flight {
         self.computing.store(true, Ordering::Relaxed);
     }
 
-    /// When a coarser answer is better than a later one: the most patient of those who wait decides; never, if one of them has time.
-    pub fn due(&self) -> Option<Instant> {
-        let dues = self.dues.lock();
-        dues.iter().map(|(_, due)| *due).reduce(|most, due| Some(most?.max(due?))).flatten()
+    /// Of all who wait: the most patient one decides.
+    pub fn patience(&self) -> Patience {
+        let all = self.patience.lock();
+        all.iter().map(|(_, patience)| *patience).reduce(Patience::most).unwrap_or_default()
     }
 
     /// One more waits; its number.
-    fn wait_until(&self, due: Option<Instant>) -> u64 {
-        let mut dues = self.dues.lock();
-        let number = dues.iter().map(|(number, _)| number + 1).max().unwrap_or(0);
-        dues.push((number, due));
+    fn wait_for(&self, patience: Patience) -> u64 {
+        let mut all = self.patience.lock();
+        let number = all.iter().map(|(number, _)| number + 1).max().unwrap_or(0);
+        all.push((number, patience));
         number
     }
 
@@ -108,10 +110,10 @@ impl Waiter {
     }
 
     /// None if the last one has left already.
-    pub(super) fn join(session: &Arc<Session>, flight: &Arc<Flight>, due: Option<Instant>) -> Option<Self> {
+    pub(super) fn join(session: &Arc<Session>, flight: &Arc<Flight>, patience: Patience) -> Option<Self> {
         let one_more = |waiters| (waiters > 0).then_some(waiters + 1);
         flight.waiters.fetch_update(Ordering::AcqRel, Ordering::Acquire, one_more).ok()?;
-        let number = flight.wait_until(due);
+        let number = flight.wait_for(patience);
         Some(Self { session: session.clone(), flight: flight.clone(), number })
     }
 
@@ -130,7 +132,7 @@ impl Waiter {
 
 impl Drop for Waiter {
     fn drop(&mut self) {
-        self.flight.dues.lock().retain(|(number, _)| *number != self.number);
+        self.flight.patience.lock().retain(|(number, _)| *number != self.number);
         if self.flight.waiters.fetch_sub(1, Ordering::AcqRel) == 1 && self.flight.outcome.borrow().is_none() {
             metrics::counter!("ada_cancelled_total", "stage" => self.flight.stage().word()).increment(1);
             self.session.slot.lock().release(&self.flight);

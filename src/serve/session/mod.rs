@@ -8,7 +8,7 @@ pub use table::Sessions;
 
 use crate::{
     model::agent::{Agent, Chunk, Episode, Executed, Observation, SamplerOptions},
-    serve::error::ServiceError,
+    serve::{engine::Patience, error::ServiceError},
 };
 use parking_lot::Mutex;
 use sha2::{Digest, Sha256};
@@ -170,8 +170,7 @@ impl Session {
         Self { id: Uuid::new_v4(), model, agent, options, request_id, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
     }
 
-    /// Takes up a step, of this episode if one is named: replays, joins or leads it; after `due` the caller prefers a coarser answer to a later
-    /// one.
+    /// Takes up a step, of this episode if one is named: replays, joins or leads it, for a caller who has this patience.
     ///
     /// # Errors
     /// If the episode is over, the step out of order, busy, or known with another observation, or if the session has ended.
@@ -180,7 +179,7 @@ impl Session {
         (episode, step): (Option<u64>, u64),
         key: Key,
         now: Instant,
-        due: Option<Instant>,
+        patience: Patience,
     ) -> Result<Entry, ServiceError> {
         let mut slot = self.slot.lock();
         if slot.ended {
@@ -204,11 +203,11 @@ impl Session {
             if flight.key != key {
                 return Err(ServiceError::StepPayloadMismatch { step, committed });
             }
-            if let Some(waiter) = Waiter::join(self, flight, due) {
+            if let Some(waiter) = Waiter::join(self, flight, patience) {
                 return Ok(Entry::Join(waiter));
             }
         }
-        let waiter = Waiter::lead(self, Flight::new(step, key, now, due));
+        let waiter = Waiter::lead(self, Flight::new(step, key, now, patience));
         slot.flight = Some(waiter.flight().clone());
         Ok(Entry::Lead(waiter, slot.committed.episode.clone()))
     }

@@ -36,7 +36,7 @@ pub enum Kind {
 use Kind::{Counter, Gauge, Histogram};
 
 /// Every metric: name, kind, meaning.
-pub const CATALOGUE: [(&str, Kind, &str); 33] = [
+pub const CATALOGUE: [(&str, Kind, &str); 34] = [
     ("ada_build_info", Gauge, "1, labelled by version"),
     ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
     ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
@@ -46,18 +46,19 @@ pub const CATALOGUE: [(&str, Kind, &str); 33] = [
     ("ada_connections_timed_out_total", Counter, "connections closed because they did not speak in time"),
     ("ada_http_requests_total", Counter, "requests of either face, by face, route and status"),
     ("ada_http_request_duration_seconds", Histogram, "until the response head of a request, by face"),
-    ("ada_acts_total", Counter, "acts, by model, face and outcome (OK or the error's reason)"),
+    ("ada_acts_total", Counter, "acts, by model, face and outcome (OK, the error's reason, or CANCELLED: its caller hung up)"),
     ("ada_act_duration_seconds", Histogram, "an act from arrival to answer, by model"),
     ("ada_act_queue_seconds", Histogram, "waiting for a worker"),
     ("ada_act_compute_seconds", Histogram, "network evaluations of an act, batch mates included"),
     ("ada_act_commit_seconds", Histogram, "storing the new episode with its answer"),
     ("ada_act_network_evaluations", Histogram, "denoiser evaluations of an act"),
-    ("ada_network_evaluations_total", Counter, "denoiser evaluations, by model (one per act and tick)"),
+    ("ada_network_evaluations_total", Counter, "denoiser evaluations of acts that were computed, by model (one per act and tick)"),
     ("ada_wasted_network_evaluations_total", Counter, "evaluations of acts that were dropped"),
     ("ada_batch_size", Histogram, "acts that share one network evaluation"),
     ("ada_batches_total", Counter, "network evaluations of whole batches"),
     ("ada_degraded_total", Counter, "acts that a deadline cut short"),
     ("ada_queue_depth", Gauge, "acts that wait for a worker"),
+    ("ada_queue_wait_estimate_seconds", Gauge, "how long an act that came now and had its turn last would wait"),
     ("ada_inflight_acts", Gauge, "acts in the batches of the workers"),
     ("ada_shed_total", Counter, "requests refused because a bound was reached, by reason"),
     ("ada_cancelled_total", Counter, "acts that nobody waited for any more, by stage"),

@@ -9,7 +9,7 @@ use ada_diffuser::{
         nn::params::Params,
         normalizer::Affine,
     },
-    serve::engine::{Engine, EngineOptions, Failure, Finished, Job, Question, Refusal, Ticket},
+    serve::engine::{Engine, EngineOptions, Failure, Finished, Job, Patience, Question, Refusal, Ticket},
 };
 use std::{
     path::Path,
@@ -23,7 +23,7 @@ type Outcome = Result<Finished, Failure>;
 struct Seat {
     outcome: mpsc::Sender<Outcome>,
     gate: Option<mpsc::Receiver<()>>,
-    due: Option<Instant>,
+    patience: Patience,
     panics: bool,
 }
 
@@ -39,8 +39,8 @@ impl Ticket for Seat {
         }
     }
 
-    fn due(&self) -> Option<Instant> {
-        self.due
+    fn patience(&self) -> Patience {
+        self.patience
     }
 
     fn settle(self, outcome: Outcome) {
@@ -73,14 +73,21 @@ fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Recei
     let question = Question { episode, observation };
     let descent = question.begin(asked).unwrap();
     let (outcome, receiver) = mpsc::channel();
-    let ticket = Seat { outcome, gate: None, due: None, panics: false };
+    let ticket = Seat { outcome, gate: None, patience: Patience::default(), panics: false };
     let now = Instant::now();
-    (Job { agent: run_on.clone(), question, descent, ticket, submitted: now, turn_by: now }, receiver)
+    (Job { agent: run_on.clone(), question, descent, ticket, submitted: now, turn_by: now, client: seed }, receiver)
 }
 
 fn one_worker(batch_len_max: usize) -> Engine<Seat> {
-    Engine::start(EngineOptions { workers: 1, queue_len_max: 64, queue_bytes_max: 1 << 20, batch_len_max, deadline_margin: Duration::ZERO })
-        .unwrap()
+    Engine::start(EngineOptions {
+        workers: 1,
+        queue_len_max: 64,
+        queue_bytes_max: 1 << 20,
+        batch_len_max,
+        deadline_margin: Duration::ZERO,
+        wait_max: Duration::from_secs(60),
+    })
+    .unwrap()
 }
 
 /// An act of another model makes the shared forward fail; its batch mates are answered as if it had not been there.
@@ -161,7 +168,7 @@ fn a_deadline_makes_larger_jumps() {
     engine.warm_up(&slow).unwrap();
     engine.warm_up(&tiny).unwrap();
     let act = |mut job: Job<Seat>, outcome: mpsc::Receiver<Outcome>, due: Instant| {
-        job.ticket.due = Some(due);
+        job.ticket.patience.due = Some(due);
         assert!(engine.submit(job).is_ok());
         outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap()
     };
@@ -186,10 +193,33 @@ fn a_deadline_makes_larger_jumps() {
 fn without_warm_up_nobody_hurries() {
     let (tiny, engine) = (agent("tiny"), one_worker(8));
     let (mut late, outcome) = job(&tiny, &tiny, 3);
-    late.ticket.due = Some(Instant::now());
+    late.ticket.patience = Patience { due: Some(Instant::now()), ends: Some(Instant::now()) };
     let expected = tiny.act(&late.question.episode, &late.question.observation).unwrap().1;
     assert!(engine.submit(late).is_ok());
     assert_eq!(outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap().chunk, expected);
+}
+
+/// What nobody will wait for is not computed: it is refused when it comes, if that is known then, and else dropped when it has its turn.
+#[test]
+fn late_acts_are_not_computed() {
+    let (slow, tiny) = (agent("slow"), agent("tiny"));
+    let engine = one_worker(1);
+    engine.warm_up(&slow).unwrap();
+    engine.warm_up(&tiny).unwrap();
+    let after = |ms| Some(Instant::now() + Duration::from_millis(ms));
+    let (mut hopeless, _) = job(&slow, &slow, 1);
+    hopeless.ticket.patience.ends = after(500);
+    assert!(matches!(engine.submit(hopeless), Err((Refusal::Late, _))), "an act of minutes");
+    let (mut first, _running) = job(&tiny, &tiny, 2);
+    let (open_gate, gate) = mpsc::channel();
+    first.ticket.gate = Some(gate);
+    assert!(engine.submit(first).is_ok());
+    let (mut waits, outcome) = job(&tiny, &tiny, 3);
+    waits.ticket.patience.ends = after(300);
+    assert!(engine.submit(waits).is_ok(), "it had time enough when it came");
+    std::thread::sleep(Duration::from_millis(400));
+    open_gate.send(()).unwrap();
+    assert!(matches!(outcome.recv_timeout(Duration::from_secs(20)).unwrap(), Err(Failure::Late)));
 }
 
 #[test]

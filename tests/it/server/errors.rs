@@ -353,10 +353,11 @@ async fn a_full_queue_and_passed_deadlines() {
         (server.open(json!({"model": "slow"})).await, server.open(json!({})).await, server.open(json!({})).await);
     let hasty = |id: &str, ms| pb::ActRequest { deadline_ms: Some(ms), ..act(id, 1, &STATE) };
     let hasty_http = |ms: u32| json!({"step": 1, "observation": {"state": STATE}, "deadline_ms": ms});
-    for (ms, reason) in [(0, "DEADLINE_ADMISSION"), (300, "DEADLINE_COMPUTE")] {
+    // With none left, and with less than the act takes.
+    for ms in [0, 300] {
         let grpc = server.agent().await.act(hasty(&running, ms)).await.unwrap_err();
         let http = server.post(&format!("/v1/sessions/{running}/act"), &hasty_http(ms)).await;
-        both(&grpc, &http, (Code::DeadlineExceeded, 504, reason));
+        both(&grpc, &http, (Code::DeadlineExceeded, 504, "DEADLINE_ADMISSION"));
     }
     let blocker = server.start_slow(&running).await;
     // The acts before may still be on their way out of the batch.
@@ -392,9 +393,9 @@ async fn a_timeout_of_a_call_is_no_deadline() {
         request.metadata_mut().insert("grpc-timeout", grpc_timeout.parse().unwrap());
         timeout(Duration::from_secs(10), agent.act(request)).await.expect("it was not heard").map(tonic::Response::into_inner)
     };
-    for (deadline_ms, grpc_timeout) in [(None, "300m"), (Some(60_000), "300m"), (None, "0n")] {
+    let (early, compute) = ("DEADLINE_ADMISSION", "DEADLINE_COMPUTE");
+    for (deadline_ms, grpc_timeout, stage) in [(None, "300m", early), (Some(60_000), "300m", compute), (None, "0n", early)] {
         let late = ask(deadline_ms, grpc_timeout).await.unwrap_err();
-        let stage = if grpc_timeout == "0n" { "DEADLINE_ADMISSION" } else { "DEADLINE_COMPUTE" };
         assert_eq!(failure(&late), (Code::DeadlineExceeded, stage.into()), "{deadline_ms:?}");
     }
     assert!(ask(Some(800), "60S").await.unwrap().degraded, "it asked for that");

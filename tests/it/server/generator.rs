@@ -52,15 +52,15 @@ async fn an_open_loop_keeps_its_own_time() {
 /// More is asked for than any machine can answer: what was due and never sent counts with the time that it waited.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_open_loop_hides_no_backlog() {
-    let report = measure("--model slow --rate 1000 --deadline-ms 40").await;
+    let report = measure("--model slow --rate 1000 --give-up-ms 40").await;
     assert!(report.unsent > 100 && report.latency_ms.p50 > 100.0, "{report:?}");
-    assert!(report.errors.keys().all(|reason| reason.starts_with("DEADLINE_")), "{report:?}");
+    assert!(report.errors.keys().eq(["GAVE_UP"]), "{report:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn failures_are_counted_by_reason() {
     let report = measure("--model slow --deadline-ms 20").await;
-    assert_eq!((report.acts, report.errors.keys().map(String::as_str).collect::<Vec<_>>()), (0, vec!["DEADLINE_COMPUTE"]));
+    assert_eq!((report.acts, report.errors.keys().map(String::as_str).collect::<Vec<_>>()), (0, vec!["DEADLINE_ADMISSION"]));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -77,15 +77,15 @@ async fn a_drain_ends_in_bounded_time_whatever_the_clients_do() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_act_in_flight_survives_a_drain() {
-    let mut server = start(|config| config.engine.anytime = false).await;
+    let mut server = start(|config| config.engine.deadline_margin_ms = 200).await;
     let id = server.open(json!({"model": "slow"})).await;
     let mut agent = server.agent().await;
     let request = pb::ActRequest { deadline_ms: Some(800), ..act(&id, 1, &STATE) };
     let in_flight = tokio::spawn(async move { agent.act(request).await });
     server.until(&id, |session| session["busy"] == true).await;
     server.stop.cancel();
-    let status = in_flight.await.unwrap().unwrap_err();
-    assert_eq!(failure(&status), (Code::DeadlineExceeded, "DEADLINE_COMPUTE".into()), "it had its time");
+    let answer = in_flight.await.unwrap().unwrap().into_inner();
+    assert!(answer.degraded && answer.step == 1, "it had its time: {answer:?}");
     timeout(Duration::from_secs(3), &mut server.done).await.expect("it did not end").unwrap().unwrap();
 }
 

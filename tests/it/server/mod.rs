@@ -120,6 +120,8 @@ pub fn config() -> Config {
     config.server.listen = "127.0.0.1:0".to_owned();
     config.server.drain_notice_ms = 0;
     config.engine.workers = 2;
+    // An act of the model `slow` is not to be refused because it takes minutes.
+    (config.limits.act_deadline_ms, config.limits.act_deadline_ms_max) = (3_600_000, 3_600_000);
     config.models.dir = PathBuf::from(models_dir());
     config.models.default = "tiny".to_owned();
     config
