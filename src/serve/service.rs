@@ -169,7 +169,7 @@ impl Service {
     /// Act.
     ///
     /// # Errors
-    /// Every row of the error table; the session is as before.
+    /// Every row of the error table; the session is as before, but see `Deadline`.
     pub async fn act(&self, request: ActRequest) -> Result<Acted, ServiceError> {
         let (arrived, face) = (Instant::now(), request.face);
         let session = self.registry().and_then(|_| self.session(&request.session_id));
@@ -312,7 +312,7 @@ impl Service {
                 (waiter, false)
             }
         };
-        wait(&waiter, arrived + stays).await.map(|answer| acted(answer, replayed))
+        wait(waiter, arrived + stays).await.map(|answer| acted(answer, replayed))
     }
 
     /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
@@ -360,11 +360,13 @@ impl Service {
     }
 }
 
-async fn wait(waiter: &Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {
-    match timeout_at(deadline.into(), waiter.outcome()).await {
-        Ok(outcome) => outcome,
-        Err(_) => Err(ServiceError::Deadline { stage: waiter.flight().stage() }),
+/// The outcome, also one that comes at the very moment of the deadline: what is committed is told.
+async fn wait(waiter: Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {
+    if let Ok(outcome) = timeout_at(deadline.into(), waiter.outcome()).await {
+        return outcome;
     }
+    let stage = waiter.flight().stage();
+    waiter.give_up().ok_or(ServiceError::Deadline { stage })
 }
 
 fn parse_id(session_id: &str) -> Result<Uuid, ServiceError> {
