@@ -233,19 +233,25 @@ async fn http2(address: SocketAddr) -> (hyper::client::conn::http2::SendRequest<
     (sender, tokio::spawn(async move { drop(connection.await) }))
 }
 
-/// Connections that only answered pings held their places for ever: 4,096 of them locked everyone out.
+/// Connections that only answered pings held their places for ever: 4,096 of them locked everyone out. So did streams that said nothing.
 #[tokio::test(flavor = "multi_thread")]
-async fn idle_connections_leave_and_streams_stay() {
+async fn idle_connections_leave_and_streams_that_work_stay() {
     let server = start(|config| config.connection.idle_timeout_ms = 300).await;
     let (sender, ended) = http2(server.address).await;
-    let mut agent = server.agent().await;
-    let stream = agent.act_stream(futures_util::stream::pending::<pb::ActRequest>()).await.unwrap();
+    let (mut silent, mut working) = (server.agent().await, server.agent().await);
+    let mut nothing = silent.act_stream(futures_util::stream::pending::<pb::ActRequest>()).await.unwrap().into_inner();
+    let slow = server.open(json!({"model": "slow"})).await;
+    let acts = futures_util::StreamExt::chain(futures_util::stream::iter([act(&slow, 1, &STATE)]), futures_util::stream::pending());
+    let _results = working.act_stream(acts).await.unwrap();
     timeout(Duration::from_secs(5), ended).await.expect("it holds its place").unwrap();
     drop(sender);
+    let idle = timeout(Duration::from_secs(5), nothing.message()).await.expect("it holds its place").unwrap_err();
+    assert_eq!((idle.code(), idle.message().contains("idle_timeout_ms")), (Code::Unavailable, true), "{idle:?}");
     tokio::time::sleep(Duration::from_millis(600)).await;
+    let session = server.get(&format!("/v1/sessions/{slow}")).await.json()["session"].clone();
+    assert_eq!(session["busy"], true, "an act in work is not idle");
     let id = server.open(json!({})).await;
-    assert_eq!(agent.act(act(&id, 1, &STATE)).await.unwrap().into_inner().step, 1, "the stream keeps its connection");
-    drop(stream);
+    assert_eq!(working.act(act(&id, 1, &STATE)).await.unwrap().into_inner().step, 1, "the stream keeps its connection");
 }
 
 /// Whoever asks and does not take the answers makes the server keep them.
