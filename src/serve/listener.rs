@@ -74,7 +74,7 @@ pub struct Gate {
 }
 
 impl Gate {
-    /// The connection will close while its peer is sending: see [`Wire`].
+    /// The connection will close while its peer is sending: see `serve::wire`.
     pub fn linger(&self) {
         self.lingers.store(true, Ordering::Relaxed);
     }
