@@ -1,8 +1,8 @@
 //! Places for connections, and what a connection does with its place: whoever only holds it loses it.
 //!
 //! A connection is busy while a request is on its way in or an answer on its way out. One that is not busy for long is asked to leave; one whose
-//! answer is not taken for long, or whose unary request does not come, is cut. Streams (ActStream, a health watch, a WebSocket) may be silent for as
-//! long as they like; of those, as of all connections, an address has only so many.
+//! answer is not taken for long, or whose unary request does not come, is cut. An ActStream or a WebSocket ends by itself when it has nothing to do for
+//! long; a health watch may be silent for as long as it likes, but of those, as of all connections, an address has only so many.
 
 use crate::serve::config::{Config, ServerConfig};
 use axum::body::Body;

@@ -3,7 +3,7 @@
 use crate::model::agent::AgentError;
 use uuid::Uuid;
 
-/// Why a request was not done; every variant leaves the session as it was.
+/// Why a request was not done; every variant leaves the session as it was, but for `Deadline`, after which somebody else may have it done.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ServiceError {
     /// The request is wrong and stays wrong: correct `field`.
@@ -83,8 +83,8 @@ pub enum ServiceError {
         /// When to try again.
         retry_after_ms: u64,
     },
-    /// The same again, with more time.
-    #[error("the deadline passed ({stage})")]
+    /// The same again, with more time: an act is taken up anew, or gives its answer if it was committed meanwhile (for another who waited longer).
+    #[error("the deadline passed ({stage}); the same again is done, or answered if it was done meanwhile")]
     Deadline {
         /// How far the act had come.
         stage: Stage,

@@ -6,12 +6,13 @@ use crate::serve::{
     grpc,
     guard::Guard,
     http::Problem,
+    wire::{Bounds, Watched, Wire},
 };
 use axum::{
     Router,
     body::Body,
     extract::MatchedPath,
-    http::{HeaderName, HeaderValue, Request, Response, StatusCode},
+    http::{HeaderName, HeaderValue, Request, Response, StatusCode, Version, header},
     response::IntoResponse,
 };
 use futures_util::FutureExt;
@@ -20,13 +21,21 @@ use hyper_util::{
     rt::{TokioExecutor, TokioIo, TokioTimer},
     server::conn::auto,
 };
-use std::{convert::Infallible, error::Error, io, panic::AssertUnwindSafe, pin::pin, sync::Arc, time::Duration, time::Instant};
+use std::{
+    convert::Infallible,
+    error::Error,
+    io,
+    panic::AssertUnwindSafe,
+    pin::pin,
+    sync::Arc,
+    sync::atomic::{AtomicBool, Ordering},
+    time::{Duration, Instant},
+};
 use tokio::{
-    io::AsyncWriteExt,
+    io::{AsyncWriteExt, copy, sink},
     net::{TcpListener, TcpStream},
     time::{interval, sleep, timeout},
 };
-use tokio_io_timeout::TimeoutStream;
 use tokio_util::{
     sync::CancellationToken,
     task::{TaskTracker, task_tracker::TaskTrackerToken},
@@ -38,8 +47,8 @@ use uuid::Uuid;
 
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
-/// For one connection too many: REST clients understand it, gRPC clients see UNAVAILABLE.
-const BUSY: &[u8] = b"HTTP/1.1 503 Service Unavailable\r\nretry-after: 1\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
+/// What one connection too many is told to wait.
+const RETRY_AFTER_FULL_MS: u64 = 1_000;
 /// After a failed accept (too many open files, mostly): the condition does not go away at once.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// What tasks get to notice the hard end.
@@ -62,12 +71,23 @@ pub struct Gate {
     _place: Arc<(Place, TaskTrackerToken)>,
     client: u64,
     hard_end: CancellationToken,
+    lingers: Arc<AtomicBool>,
 }
 
 impl Gate {
     /// Number of the connection.
     pub fn client(&self) -> u64 {
         self.client
+    }
+
+    /// The connection will close while its peer is sending: see `serve::wire`.
+    pub fn linger(&self) {
+        self.lingers.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether it will.
+    pub fn lingers(&self) -> bool {
+        self.lingers.load(Ordering::Relaxed)
     }
 
     /// Runs it to its end, or to the server's hard end.
@@ -93,7 +113,8 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
             Ok((stream, peer)) => match places.take(peer.ip()) {
                 Some(place) => {
                     client += 1;
-                    let gate = Gate { _place: Arc::new((place, tracker.token())), client, hard_end: hard_end.clone() };
+                    let (place, hard_end) = (Arc::new((place, tracker.token())), hard_end.clone());
+                    let gate = Gate { _place: place, client, hard_end, lingers: Arc::default() };
                     tokio::spawn(connection(stream, faces.clone(), config.clone(), leave.clone(), gate));
                 }
                 None => turn_away(stream),
@@ -113,9 +134,18 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
     }
 }
 
+/// One connection too many: REST clients understand the answer, gRPC clients see UNAVAILABLE.
 fn turn_away(mut stream: TcpStream) {
     metrics::counter!("ada_connections_refused_total").increment(1);
-    tokio::spawn(async move { timeout(ACCEPT_PAUSE, stream.write_all(BUSY)).await });
+    let full = Problem::new(StatusCode::SERVICE_UNAVAILABLE, "CONNECTIONS_FULL", "there is no place for another connection");
+    let answer = full.after(RETRY_AFTER_FULL_MS).into_http1();
+    let tell = async move {
+        stream.write_all(&answer).await?;
+        stream.shutdown().await?;
+        // Closing on a request that is not read would cost the peer the answer.
+        copy(&mut stream, &mut sink()).await
+    };
+    tokio::spawn(timeout(ACCEPT_PAUSE, tell));
 }
 
 async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, leave: CancellationToken, gate: Gate) {
@@ -154,9 +184,8 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &Cancella
     let patience = Patience { body: ms(config.connection.body_read_timeout_ms), write: ms(config.connection.write_timeout_ms) };
     let answer = service_fn(|request| answer(request, faces.clone(), gate.clone(), activity.clone(), patience));
     let builder = builder(config);
-    let mut stream = TimeoutStream::new(stream);
-    stream.set_write_timeout(Some(patience.write));
-    let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(Box::pin(stream)), answer));
+    let wire = Wire::new(stream, gate.clone(), Bounds::new(config));
+    let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(wire), answer));
     let (mut looks, mut is_leaving) = (interval(look_interval(config)), false);
     let idle_max = Duration::from_millis(config.connection.idle_timeout_ms);
     let ended = loop {
@@ -240,11 +269,14 @@ async fn answer(
     let (id, path) = (request_id(&request), request.uri().path().to_owned());
     let span = tracing::info_span!("request", %id, face, method = %request.method());
     let is_stream = is_grpc && grpc::is_stream(&path);
-    let mut request = request.map(|body| match is_grpc && !is_stream {
-        true => Body::new(TimeoutBody::new(patience.body, body)),
-        false => Body::new(body),
+    let is_http1 = request.version() < Version::HTTP_2;
+    let mut request = request.map(|body| match (is_http1, is_grpc && !is_stream) {
+        (true, false) => Body::new(Watched::new(body, gate.clone())),
+        (true, true) => Body::new(TimeoutBody::new(patience.body, Watched::new(body, gate.clone()))),
+        (false, true) => Body::new(TimeoutBody::new(patience.body, body)),
+        (false, false) => Body::new(body),
     });
-    request.extensions_mut().insert(gate);
+    request.extensions_mut().insert(gate.clone());
     let refused = faces.guard.refuses(&request);
     let work = async move {
         match refused {
@@ -268,6 +300,9 @@ async fn answer(
     metrics::histogram!("ada_http_request_duration_seconds", "face" => face).record(begin.elapsed().as_secs_f64());
     if let Ok(id) = HeaderValue::from_str(&id) {
         response.headers_mut().insert(REQUEST_ID, id);
+    }
+    if is_http1 && gate.lingers() && response.status() == StatusCode::PAYLOAD_TOO_LARGE {
+        response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
     }
     let until = (!is_stream).then(|| Instant::now() + patience.write);
     Ok(response.map(|body| open.until_taken(body, until)))

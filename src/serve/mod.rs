@@ -17,6 +17,7 @@ mod seat;
 pub mod service;
 pub mod session;
 pub mod telemetry;
+mod wire;
 
 use config::Config;
 use guard::Guard;

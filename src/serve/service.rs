@@ -13,12 +13,15 @@ use crate::{
         telemetry,
     },
 };
-use futures_util::{Stream, StreamExt, future::join_all};
+use futures_util::{Stream, StreamExt, future::join_all, stream};
 use std::{
-    sync::{Arc, OnceLock},
+    sync::{
+        Arc, OnceLock,
+        atomic::{AtomicUsize, Ordering},
+    },
     time::{Duration, Instant},
 };
-use tokio::time::timeout_at;
+use tokio::time::{timeout, timeout_at};
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
@@ -171,7 +174,7 @@ impl Service {
     /// Act.
     ///
     /// # Errors
-    /// Every row of the error table; the session is as before.
+    /// Every row of the error table; the session is as before, but see `Deadline`.
     pub async fn act(&self, request: ActRequest) -> Result<Acted, ServiceError> {
         let mut count = Count { arrived: Instant::now(), caller: request.caller, model: "unknown".to_owned(), is_told: false };
         let session = self.registry().and_then(|_| self.session(&request.session_id));
@@ -204,15 +207,21 @@ impl Service {
     }
 
     /// ActStream: answers as they are ready, at most `limits.stream_acts_max` in work; ends when the acts end, or draining begins and the last one is
-    /// answered. An act that could not be read (`Err`) is answered with its error, here as in a batch.
-    pub fn act_stream(self: Arc<Self>, acts: impl Stream<Item = Result<ActRequest, ActResult>>) -> impl Stream<Item = ActResult> {
-        let width = self.config.limits.stream_acts_max;
+    /// answered, or with [`Idle`]. An act that could not be read (`Err`) is answered with its error, here as in a batch.
+    pub fn act_stream(
+        self: Arc<Self>,
+        acts: impl Stream<Item = Result<ActRequest, ActResult>>,
+    ) -> impl Stream<Item = Result<ActResult, Idle>> {
+        let (width, idle_max) = (self.config.limits.stream_acts_max, Duration::from_millis(self.config.connection.idle_timeout_ms));
         let draining = self.draining.clone().cancelled_owned();
+        let in_work = Arc::new(AtomicUsize::new(0));
+        let begun = in_work.clone();
         let answer = move |act| {
+            begun.fetch_add(1, Ordering::Relaxed);
             let service = self.clone();
             async move { service.act_result(act).await }
         };
-        acts.take_until(draining).map(answer).buffer_unordered(width)
+        until_idle(acts.take_until(draining).map(answer).buffer_unordered(width), in_work, idle_max)
     }
 
     /// ResetSession.
@@ -318,7 +327,7 @@ impl Service {
                 (waiter, false)
             }
         };
-        wait(&waiter, arrived + stays).await.map(|answer| acted(answer, replayed))
+        wait(waiter, arrived + stays).await.map(|answer| acted(answer, replayed))
     }
 
     /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
@@ -366,11 +375,38 @@ impl Service {
     }
 }
 
-async fn wait(waiter: &Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {
-    match timeout_at(deadline.into(), waiter.outcome()).await {
-        Ok(outcome) => outcome,
-        Err(_) => Err(ServiceError::Deadline { stage: waiter.flight().stage() }),
+/// Why an ActStream ends of which nothing was asked for `connection.idle_timeout_ms`, while nothing was in work: it holds a place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Idle;
+
+/// The results, of so many acts as are in work, until none comes and none is to be expected.
+fn until_idle<T>(results: impl Stream<Item = T>, in_work: Arc<AtomicUsize>, idle_max: Duration) -> impl Stream<Item = Result<T, Idle>> {
+    stream::unfold(Some(Box::pin(results)), move |results| {
+        let in_work = in_work.clone();
+        async move {
+            let mut results = results?;
+            loop {
+                match timeout(idle_max, results.next()).await {
+                    Ok(None) => return None,
+                    Ok(Some(result)) => {
+                        in_work.fetch_sub(1, Ordering::Relaxed);
+                        return Some((Ok(result), Some(results)));
+                    }
+                    Err(_) if in_work.load(Ordering::Relaxed) == 0 => return Some((Err(Idle), None)),
+                    Err(_) => {}
+                }
+            }
+        }
+    })
+}
+
+/// The outcome, also one that comes at the very moment of the deadline: what is committed is told.
+async fn wait(waiter: Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {
+    if let Ok(outcome) = timeout_at(deadline.into(), waiter.outcome()).await {
+        return outcome;
     }
+    let stage = waiter.flight().stage();
+    waiter.give_up().ok_or(ServiceError::Deadline { stage })
 }
 
 fn parse_id(session_id: &str) -> Result<Uuid, ServiceError> {

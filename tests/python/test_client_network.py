@@ -127,6 +127,47 @@ def test_a_body_that_is_too_large_is_sent_once_and_says_so(address: str, face: s
         assert session.act(np.zeros(4)).step == 1
 
 
+def _until(visitor: socket.socket, end: bytes) -> bytes:
+    """What comes until then."""
+    said = b""
+    while not said.endswith(end):
+        said += visitor.recv(65536)
+    return said
+
+
+PROBLEM = b'{"status": 413, "reason": "TOO_LARGE", "detail": "bytes of a message exceeds 7"}'
+
+
+def test_a_large_body_is_announced_and_not_sent_to_whoever_refuses_it() -> None:
+    """Megabytes went to a server that had refused them at their first header, and where the connection broke they went six times."""
+    heard: list[bytes] = []
+
+    def refuse(visitor: socket.socket) -> None:
+        heard.append(_until(visitor, b"\r\n\r\n"))
+        visitor.sendall(b"HTTP/1.1 413 Payload Too Large\r\nContent-Length: %d\r\n\r\n%s" % (len(PROBLEM), PROBLEM))
+        while more := visitor.recv(65536):
+            heard.append(more)
+
+    with answering(refuse) as port, Client(f"http://127.0.0.1:{port}", timeout_s=5.0) as client, pytest.raises(TooLarge):
+        client.open_session("m" * 1_000_000)
+    assert len(heard) == 1 and b"expect: 100-continue" in heard[0].lower(), [said[:200] for said in heard]
+
+
+@pytest.mark.parametrize("goes_on", [b"HTTP/1.1 100 Continue\r\n\r\n", b""])
+def test_a_large_body_is_sent_to_whoever_wants_it(goes_on: bytes) -> None:
+    heard: list[bytes] = []
+
+    def listen(visitor: socket.socket) -> None:
+        _until(visitor, b"\r\n\r\n")
+        visitor.sendall(goes_on)
+        heard.append(_until(visitor, b'"}'))
+        visitor.sendall(b"HTTP/1.1 413 Payload Too Large\r\nContent-Length: %d\r\n\r\n%s" % (len(PROBLEM), PROBLEM))
+
+    with answering(listen) as port, Client(f"http://127.0.0.1:{port}", timeout_s=5.0) as client, pytest.raises(TooLarge):
+        client.open_session("m" * 1_000_000)
+    assert len(heard) == 1 and heard[0].count(b"m" * 1_000_000) == 1
+
+
 def test_a_real_batch_beyond_the_limit(address: str) -> None:
     """260 acts were TooLarge: 'number of acts exceeds 256'."""
     with Client(f"http://{address}") as client:

@@ -107,7 +107,7 @@ class Overloaded(AdaError):
 
 
 class DeadlineExceeded(AdaError):
-    """The same again: nothing was changed, or the answer waits for the retry. DEADLINE_*, or this client's timeout."""
+    """The same again: it happens now, or gives the answer if it was committed meanwhile. DEADLINE_*, or this client's timeout."""
 
     retryable = True
 
@@ -174,7 +174,9 @@ _BY_HTTP_STATUS: dict[int, type[AdaError]] = {
     408: DeadlineExceeded,
     410: SessionGone,
     413: TooLarge,
+    414: TooLarge,
     429: Overloaded,
+    431: TooLarge,
     500: ServerFault,
     502: Unavailable,
     503: Unavailable,

@@ -65,7 +65,7 @@ pub struct ConnectionConfig {
     pub body_read_timeout_ms: u64,
     /// Until an answer is taken, from its head on; then the connection is cut. Streams may take their time.
     pub write_timeout_ms: u64,
-    /// A connection without any request for so long is asked to leave, whatever pings it answers.
+    /// A connection without any request, or a stream without any act, for so long is asked to leave, whatever pings it answers.
     pub idle_timeout_ms: u64,
     /// Bytes of all headers of a request.
     pub header_bytes_max: u32,
@@ -75,7 +75,7 @@ pub struct ConnectionConfig {
     pub streams_max: u32,
     /// HTTP/2 streams that the client has reset and that are not yet cleared away; more is taken as an attack.
     pub pending_resets_max: usize,
-    /// HTTP/2 ping after so much silence.
+    /// Ping (HTTP/2, WebSocket) after so much silence.
     pub keepalive_interval_ms: u64,
     /// Close when a ping is not answered for so long.
     pub keepalive_timeout_ms: u64,

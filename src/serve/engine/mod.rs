@@ -288,8 +288,10 @@ impl<T: Ticket> Shared<T> {
         // One that may be degraded needs time for a single evaluation.
         let least = costs.act(if patience.due.is_some() { 1 } else { evaluations }, batch).mul_f64(slowness.max(1.0));
         let left = patience.ends.map(|ends| ends.saturating_duration_since(Instant::now()));
+        // And takes no more than it has, which it shares with a full batch.
+        let hurried = patience.due.and(left).map(|left| left / self.options.batch_len_max as u32);
         Some(Ask {
-            work: costs.share(evaluations),
+            work: costs.share(evaluations).min(hurried.unwrap_or(Duration::MAX)),
             wait_max: self.options.wait_max.max(costs.act(evaluations, self.options.batch_len_max) * WAIT_ACTS),
             useful: left.map_or(Some(Duration::MAX), |left| left.checked_sub(least))?,
             ..ask

@@ -15,7 +15,7 @@ use crate::serve::{
     error::{ServiceError, Stage},
     listener::Gate,
     request::ActResult,
-    service::Service,
+    service::{Idle, Service},
 };
 use axum::{http::HeaderMap, middleware, response::Response as HttpResponse};
 use futures_util::{Stream, StreamExt};
@@ -134,7 +134,8 @@ impl agent_server::Agent for Face {
             Ok(act) => convert::act_request(act, timeout, client),
             Err(status) => Err(ActResult { session_id: String::new(), step: 0, result: Err(unreadable(status.code(), limit)) }),
         });
-        let results = self.0.clone().act_stream(acts).map(|result| Ok(convert::act_result(result)));
+        let idle = |Idle| Status::unavailable("no act for connection.idle_timeout_ms: open another stream");
+        let results = self.0.clone().act_stream(acts).map(move |result| result.map(convert::act_result).map_err(idle));
         Ok(Response::new(Box::pin(results)))
     }
 

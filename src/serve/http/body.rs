@@ -1,19 +1,21 @@
 //! Reading a JSON body: bounded in bytes, in time and in depth, strict in its fields.
 
+use super::strict::Strict;
 use crate::serve::{
     config::Config,
     error::{ServiceError, Stage},
 };
 use axum::body::{Body, HttpBody, to_bytes};
-use serde::de::DeserializeOwned;
-use serde_json::error::Category;
-use std::time::Duration;
+use http_body_util::LengthLimitError;
+use serde::de::{DeserializeOwned, Deserializer, IgnoredAny, MapAccess, Visitor};
+use serde_json::{Value, error::Category};
+use std::{error::Error, fmt, time::Duration};
 use tokio::time::timeout;
 
 /// The bytes of a body.
 ///
 /// # Errors
-/// `TooLarge`, or `Deadline` if it does not arrive in time.
+/// `TooLarge`; `Deadline` if it does not arrive in time; `Invalid` if it breaks off, or its chunks are none.
 pub async fn bytes(body: Body, config: &Config) -> Result<axum::body::Bytes, ServiceError> {
     let limit = config.limits.message_bytes_max;
     let too_large = || {
@@ -26,8 +28,8 @@ pub async fn bytes(body: Body, config: &Config) -> Result<axum::body::Bytes, Ser
     let patience = Duration::from_millis(config.connection.body_read_timeout_ms);
     match timeout(patience, to_bytes(body, limit)).await {
         Ok(Ok(bytes)) => Ok(bytes),
-        // The other cause, a connection that breaks, leaves nobody to answer.
-        Ok(Err(_)) => Err(too_large()),
+        Ok(Err(error)) if error.source().is_some_and(|cause| cause.is::<LengthLimitError>()) => Err(too_large()),
+        Ok(Err(_)) => Err(ServiceError::invalid("body", "breaks off, or its chunks are not of HTTP")),
         Err(_) => Err(ServiceError::Deadline { stage: Stage::Admission }),
     }
 }
@@ -42,9 +44,45 @@ pub fn parse<T: DeserializeOwned>(bytes: &[u8], config: &Config) -> Result<T, Se
         return Err(ServiceError::invalid("body", format!("is nested deeper than {depth_max}")));
     }
     let mut json = serde_json::Deserializer::from_slice(bytes);
-    let value = serde_path_to_error::deserialize(&mut json).map_err(|error| misread(bytes, &error))?;
+    let value = serde_path_to_error::deserialize(Strict(&mut json)).map_err(|error| misread(bytes, &error))?;
     json.end().map_err(not_json)?;
     Ok(value)
+}
+
+/// Whom a message is for, as far as it says so before it becomes unreadable.
+#[derive(Debug, Default, PartialEq)]
+pub struct Heading {
+    /// `session_id`.
+    pub session_id: Option<String>,
+    /// `step`; 0: it does not say.
+    pub step: u64,
+}
+
+/// What can be read of the heading of a message that [`parse`] refuses: its error is to bear the step it belongs to.
+pub fn heading(bytes: &[u8]) -> Heading {
+    struct Reader<'a>(&'a mut Heading);
+    impl<'de> Visitor<'de> for Reader<'_> {
+        type Value = ();
+
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("an object")
+        }
+
+        fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+            while let Some(name) = map.next_key::<String>()? {
+                match name.as_str() {
+                    "session_id" => self.0.session_id = map.next_value::<Value>()?.as_str().map(str::to_owned),
+                    "step" => self.0.step = map.next_value::<Value>()?.as_u64().unwrap_or_default(),
+                    _ => drop(map.next_value::<IgnoredAny>()?),
+                }
+            }
+            Ok(())
+        }
+    }
+    let mut heading = Heading::default();
+    // What was read before it failed stands.
+    let _unreadable = serde_json::Deserializer::from_slice(bytes).deserialize_map(Reader(&mut heading));
+    heading
 }
 
 fn misread(bytes: &[u8], error: &serde_path_to_error::Error<serde_json::Error>) -> ServiceError {
@@ -114,6 +152,23 @@ mod tests {
     fn depths() {
         for (text, expected) in [("", 0), ("1", 0), ("[1,[2],{}]", 2), (r#"{"[[[":"\"[[["}"#, 1), ("]]]][", 1), (r#""\\"[["#, 2)] {
             assert_eq!(depth(text.as_bytes()), expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn headings() {
+        for (text, session_id, step) in [
+            (r#"{"step": 7, "goal": [1, {"step": 3}], "session_id": "a"}"#, Some("a"), 7),
+            (r#"{"step": 7, "observation": {"state": [NaN]}, "session_id": "a"}"#, None, 7),
+            (r#"{"observation": {"state": [1e999]}, "step": 7"#, None, 7),
+            (r#"{"observation": {"state": [NaN]}, "step": 7}"#, None, 0),
+            (r#"{"step": "7", "session_id": 1}"#, None, 0),
+            (r#"{"step": -7, "session_id": "a"}"#, Some("a"), 0),
+            ("[7]", None, 0),
+            ("no JSON", None, 0),
+            ("", None, 0),
+        ] {
+            assert_eq!(heading(text.as_bytes()), Heading { session_id: session_id.map(str::to_owned), step }, "{text}");
         }
     }
 }

@@ -50,11 +50,11 @@ pub struct OptionsBody {
 #[serde(untagged, expecting = "expected a finite number or \"infinity\"")]
 enum Kappa {
     Nats(#[serde(deserialize_with = "finite")] f32),
-    Unbounded(Unbounded),
+    Unbounded(#[serde(deserialize_with = "infinity")] Unbounded),
 }
 
 /// `"infinity"`.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Copy, Debug, Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 enum Unbounded {
     Infinity,
@@ -64,6 +64,12 @@ enum Unbounded {
 fn finite<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
     let value = f32::deserialize(deserializer)?;
     if value.is_finite() { Ok(value) } else { Err(de::Error::custom("is not a finite number")) }
+}
+
+/// The word alone: what is untagged is read from a copy that is not [`super::strict`] any more.
+fn infinity<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Unbounded, D::Error> {
+    let word = String::deserialize(deserializer)?;
+    if word == "infinity" { Ok(Unbounded::Infinity) } else { Err(de::Error::custom("is another word")) }
 }
 
 impl From<Kappa> for f32 {

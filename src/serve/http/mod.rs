@@ -6,6 +6,7 @@ mod json;
 mod problem;
 mod routes;
 mod stream;
+mod strict;
 
 pub use crate::serve::listener::Gate;
 pub use problem::Problem;

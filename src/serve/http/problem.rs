@@ -78,6 +78,24 @@ impl Problem {
             error_id: None,
         }
     }
+
+    /// One that passes by itself.
+    pub fn after(self, retry_after_ms: u64) -> Self {
+        Self { retry_after_ms: Some(retry_after_ms), ..self }
+    }
+
+    /// The whole answer in the text of HTTP/1.1, for whoever cannot have it by way of a request. It is the last on its connection.
+    pub fn into_http1(self) -> Vec<u8> {
+        let body = serde_json::to_string(&self).expect("a problem is plain data, or it is a bug");
+        let retry_after = self.retry_after_s().map_or_else(String::new, |seconds| format!("retry-after: {seconds}\r\n"));
+        let (status, title, len) = (self.status, self.title, body.len());
+        let head = format!("HTTP/1.1 {status} {title}\r\ncontent-type: {CONTENT_TYPE}\r\ncontent-length: {len}\r\n{retry_after}");
+        format!("{head}connection: close\r\n\r\n{body}").into_bytes()
+    }
+
+    fn retry_after_s(&self) -> Option<u64> {
+        self.retry_after_ms.map(|ms| ms.div_ceil(1000))
+    }
 }
 
 impl From<&ServiceError> for Problem {
@@ -111,7 +129,7 @@ impl IntoResponses for Problem {
 impl IntoResponse for Problem {
     fn into_response(self) -> Response {
         let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
-        let retry_after_s = self.retry_after_ms.map(|ms| ms.div_ceil(1000));
+        let retry_after_s = self.retry_after_s();
         let mut response = (status, axum::Json(self)).into_response();
         let headers = response.headers_mut();
         headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(CONTENT_TYPE));

@@ -3,7 +3,7 @@
 use crate::serve::{
     engine::Patience,
     error::{ServiceError, Stage},
-    session::{Key, Outcome, Session},
+    session::{Answer, Key, Outcome, Session},
 };
 use parking_lot::Mutex;
 use std::{
@@ -53,7 +53,7 @@ impl Flight {
         }
     }
 
-    fn leave(&self) {
+    pub(super) fn leave(&self) {
         let leave = self.leave.lock().take();
         if let Some(leave) = leave {
             leave();
@@ -86,6 +86,12 @@ impl Flight {
 
     /// Tells everyone who waits; the first outcome stands.
     pub(super) fn settle(&self, outcome: Outcome) {
+        self.tell(outcome);
+        self.leave();
+    }
+
+    /// The same for whoever holds the session's slot, and has to [`Flight::leave`] afterwards.
+    pub(super) fn tell(&self, outcome: Outcome) {
         self.outcome.send_if_modified(|current| {
             let first = current.is_none();
             if first {
@@ -93,7 +99,6 @@ impl Flight {
             }
             first
         });
-        self.leave();
     }
 }
 
@@ -128,6 +133,14 @@ impl Waiter {
         let settled = outcome.wait_for(Option::is_some).await.ok().and_then(|outcome| outcome.clone());
         settled.unwrap_or(Err(ServiceError::SessionNotFound))
     }
+
+    /// Leaves, and gives the answer if it is committed after all. If not, then the act of the last who leaves will not be; one that others wait
+    /// for may be.
+    pub fn give_up(self) -> Option<Arc<Answer>> {
+        let flight = self.flight.clone();
+        drop(self);
+        flight.outcome.borrow().clone()?.ok()
+    }
 }
 
 impl Drop for Waiter {
@@ -138,5 +151,60 @@ impl Drop for Waiter {
             self.session.slot.lock().release(&self.flight);
             self.flight.leave();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        model::{agent::Observation, checkpoint},
+        serve::{
+            config::SessionsConfig,
+            session::{Answer, Entry, Opening, Sessions, Timings, key_of},
+        },
+    };
+    use std::{path::Path, thread, time::Duration};
+
+    /// An act that was committed while its caller's time ran out was answered with a deadline and "nothing was changed".
+    #[test]
+    fn a_deadline_at_the_commit_is_told_the_truth() {
+        let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
+        let (options, ttl, request_id) = (agent.config().sampler.clone(), Duration::from_secs(60), String::new());
+        let episode = agent.open(1, &options).unwrap();
+        let seen = Observation { state: vec![0.1; 4], ..Observation::default() };
+        let (after, chunk) = agent.act(&episode, &seen).unwrap();
+        let opening = Opening { model: "tiny".into(), agent, episode: episode.clone(), options, ttl, request_id };
+        let session = Sessions::new(SessionsConfig::default()).open(opening, Instant::now()).unwrap();
+        let (mut told, mut silent) = (0, 0);
+        for turn in 0..4_000 {
+            let Ok(Entry::Lead(waiter, _)) = session.enter((None, 1), key_of(&seen), Instant::now(), Patience::default()) else {
+                panic!("it is the next")
+            };
+            let (flight, together) = (waiter.flight().clone(), AtomicUsize::new(0));
+            let (model, model_digest) = (session.model.clone(), String::new());
+            let answer = Answer { session: session.id, step: 1, chunk: chunk.clone(), timings: Timings::default(), model, model_digest };
+            // Both begin within a moment that wanders over the commit.
+            let meet = |pauses: usize| {
+                together.fetch_add(1, Ordering::AcqRel);
+                while together.load(Ordering::Acquire) < 2 {
+                    thread::yield_now();
+                }
+                (0..pauses).for_each(|_| std::hint::spin_loop());
+            };
+            let late = thread::scope(|threads| {
+                threads.spawn(|| {
+                    let after = after.clone();
+                    meet(10);
+                    session.commit(&flight, after, answer);
+                });
+                meet(turn % 100);
+                waiter.give_up()
+            });
+            assert_eq!(late.is_some(), session.summary(Instant::now()).committed_step == 1);
+            *if late.is_some() { &mut told } else { &mut silent } += 1;
+            session.reset(|_| episode.clone(), None, String::new(), Instant::now()).unwrap();
+        }
+        assert!(told > 0 && silent > 0, "both orders occur: {told}, {silent}");
     }
 }

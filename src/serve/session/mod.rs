@@ -223,18 +223,20 @@ impl Session {
     /// Commits the episode and the answer together, if the flight is still the session's; a flight that was dropped meanwhile changes nothing.
     pub fn commit(&self, flight: &Arc<Flight>, episode: Episode, answer: Answer) {
         let answer = Arc::new(answer);
-        let outcome = {
+        {
             let mut slot = self.slot.lock();
-            if slot.release(flight) && slot.committed.step + 1 == flight.step {
+            let outcome = if slot.release(flight) && slot.committed.step + 1 == flight.step {
                 self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
                 slot.committed = Committed { step: flight.step, episode: Arc::new(episode), last: Some((flight.key, answer.clone())) };
                 slot.touched = Instant::now();
                 Ok(answer)
             } else {
                 Err(ServiceError::SessionNotFound)
-            }
-        };
-        flight.settle(outcome);
+            };
+            // Told with the commit, for those whose time is over at this moment: see `Waiter::give_up`.
+            flight.tell(outcome);
+        }
+        flight.leave();
     }
 
     /// Ends a flight without a commit; the session stands where it stood.

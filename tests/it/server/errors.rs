@@ -193,6 +193,7 @@ async fn observations_that_do_not_fit() {
     assert_eq!(server.act(&id, 1, &STATE).await.status, 200, "nothing is lost");
 }
 
+/// An array stood for an object, its values in the order of the server's fields, and an object for a word.
 #[tokio::test(flavor = "multi_thread")]
 async fn json_that_does_not_fit() {
     let server = start(|config| config.limits.json_depth_max = 8).await;
@@ -204,6 +205,10 @@ async fn json_that_does_not_fit() {
         ("{", request, "body"),
         ("[]", request, "body"),
         ("null", request, "body"),
+        (r#"[1,{"state":[0,0,0,0]}]"#, request, "body"),
+        (r#"{"step":1,"observation":[[0,0,0,0]]}"#, observation, "observation"),
+        (r#"{"step":1,"observation":{"state":[0,0,0,0],"executed":[[null,[0,0],0.5]]}}"#, observation, "observation.executed[0]"),
+        (r#"{"step":1,"observation":{"state":{"0":0}}}"#, observation, "observation.state"),
         (r#"{"step":1}"#, observation, "observation"),
         (r#"{"observation":{"state":[0,0,0,0]}}"#, request, "step"),
         (r#"{"step":1,"observation":{}}"#, observation, "observation.state"),
@@ -233,9 +238,19 @@ async fn json_that_does_not_fit() {
     }
     let reply = server.http("POST", &format!("/v1/sessions/{id}/act"), r#"{"session_id":"x","step":1,"observation":{"state":[]}}"#).await;
     assert_eq!((reply.status, reply.json()["field"].as_str().unwrap()), (400, "session_id"));
-    for (path, body) in [("/v1/sessions", r#"{"sed":1}"#), ("/v1/sessions", ""), (&format!("/v1/sessions/{id}/reset"), r#"{"seed":-1}"#)] {
+    let (reset, batch) = (format!("/v1/sessions/{id}/reset"), "/v1/act:batch");
+    for (path, body, field) in [
+        ("/v1/sessions", r#"{"sed":1}"#, "sed"),
+        ("/v1/sessions", "", "body"),
+        ("/v1/sessions", r#"["tiny"]"#, "body"),
+        (&reset, r#"{"seed":-1}"#, "seed"),
+        (&reset, "[3]", "body"),
+        (batch, r#"[[{"session_id":"a","step":1}]]"#, "body"),
+        (batch, r#"{"acts":[["a",1,{"state":[0,0,0,0]}]]}"#, "acts[0]"),
+    ] {
         let reply = server.http("POST", path, body).await;
         assert_eq!((reply.status, reply.reason().as_str()), (400, "REQUEST_INVALID"), "{path} {body}");
+        assert_eq!(reply.json()["field"], field, "{path} {body}");
     }
     assert_eq!(server.act(&id, 1, &STATE).await.status, 200, "nothing is lost");
 }
@@ -268,14 +283,18 @@ async fn requests_and_options_that_do_not_fit() {
     let token = pb::ListSessionsRequest { page_token: "x".into(), ..Default::default() };
     let grpc = server.agent().await.list_sessions(token).await.unwrap_err();
     both(&grpc, &server.get("/v1/sessions?page_token=x").await, (Code::InvalidArgument, 400, "REQUEST_INVALID"));
-    for (path, field) in [
-        ("/v1/sessions?page=1", "page"),
-        ("/v1/sessions?page_size=many", "page_size"),
-        ("/v1/sessions?page_size=1&page_size=2", "page_size"),
-        ("/v1/sessions/%ff", "path"),
-        ("/v1/models/%ff", "path"),
+    for (method, path, field) in [
+        ("GET", "/v1/sessions?page=1", "page"),
+        ("GET", "/v1/sessions?page_size=many", "page_size"),
+        ("GET", "/v1/sessions?page_size=1&page_size=2", "page_size"),
+        ("GET", "/v1/sessions/%ff", "path"),
+        ("DELETE", "/v1/sessions/%ff", "path"),
+        ("POST", "/v1/sessions/%ff/act", "path"),
+        ("POST", "/v1/sessions/%ff/reset", "path"),
+        ("GET", "/v1/sessions/%ff/stream", "path"),
+        ("GET", "/v1/models/%ff", "path"),
     ] {
-        let reply = server.get(path).await;
+        let reply = server.http(method, path, "").await;
         assert_eq!((reply.reason().as_str(), reply.json()["field"].as_str()), ("REQUEST_INVALID", Some(field)), "{path}: {reply:?}");
     }
     for (body, field) in [
@@ -284,6 +303,9 @@ async fn requests_and_options_that_do_not_fit() {
         (r#"{"options":{"kappa":1e39}}"#, "options.kappa"),
         (r#"{"options":{"kappa":"much"}}"#, "options.kappa"),
         (r#"{"options":{"kapa":1}}"#, "options.kapa"),
+        (r#"{"options":[true,2]}"#, "options"),
+        (r#"{"options":{"latent":{"mean":null}}}"#, "options.latent"),
+        (r#"{"options":{"kappa":{"infinity":null}}}"#, "options.kappa"),
     ] {
         let reply = server.http("POST", "/v1/sessions", body).await;
         assert_eq!((reply.reason().as_str(), reply.json()["field"].as_str()), ("OPTIONS_INVALID", Some(field)), "{body}: {reply:?}");

@@ -70,19 +70,107 @@ async fn one_connection_too_many_is_turned_away() {
     timeout(Duration::from_secs(5), until_free).await.expect("the places were not given back");
 }
 
-/// The number of headers and their bytes are bounded.
+/// An answer in the text of HTTP/1.1.
+fn reply_of(answer: &str) -> Reply {
+    let (head, text) = answer.split_once("\r\n\r\n").unwrap_or_else(|| panic!("{answer:?}"));
+    let mut lines = head.lines();
+    let status = lines.next().unwrap()["HTTP/1.1 ".len()..][..3].parse().unwrap();
+    let pairs = lines.map(|line| line.split_once(": ").unwrap());
+    let headers = pairs.map(|(name, value)| (name.parse::<hyper::header::HeaderName>().unwrap(), value.parse().unwrap())).collect();
+    Reply { status, headers, text: text.to_owned() }
+}
+
+/// The answer to bytes that were all taken, and the end of the connection.
+async fn answer_to(server: &Running, request: &[u8]) -> Reply {
+    let mut stream = TcpStream::connect(server.address).await.unwrap();
+    stream.write_all(request).await.expect("the server hangs up while it is spoken to");
+    let mut text = String::new();
+    timeout(Duration::from_secs(5), stream.read_to_string(&mut text)).await.expect("it keeps the connection").expect("it is cut");
+    reply_of(&text)
+}
+
+/// The number of headers and their bytes are bounded. The answer had no body, and what came behind the bound cut it off.
 #[tokio::test(flavor = "multi_thread")]
 async fn headers_are_bounded() {
     let server = start(|_| {}).await;
-    for (count, len) in [(100, 1), (1, 40_000)] {
+    for (count, len) in [(100, 1), (1, 40_000), (4, 400_000)] {
         let headers: String = (0..count).map(|i| format!("x-{i}: {}\r\n", "y".repeat(len))).collect();
-        let mut stream = TcpStream::connect(server.address).await.unwrap();
-        let request = format!("GET /readyz HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n");
-        // The server may answer and close before it has read everything.
-        let _closed_early = stream.write_all(request.as_bytes()).await;
-        assert!(!answer_of(&mut stream).await.starts_with("HTTP/1.1 200"), "{count} headers of {len}");
+        let reply = answer_to(&server, format!("GET /readyz HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n").as_bytes()).await;
+        assert_eq!((reply.status, reply.reason().as_str()), (431, "TOO_LARGE"), "{count} headers of {len}");
     }
+    let path = "y".repeat(70_000);
+    let reply = answer_to(&server, format!("GET /{path} HTTP/1.1\r\nhost: localhost\r\n\r\n").as_bytes()).await;
+    assert!([414, 431].contains(&reply.status) && reply.reason() == "TOO_LARGE", "{reply:?}");
     assert_eq!(server.get("/readyz").await.status, 200);
+}
+
+/// What is no HTTP was answered with a bare status, and broken chunks with TOO_LARGE.
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_no_http_is_told_so() {
+    let server = start(|_| {}).await;
+    for head in ["G@T / HTTP/1.1", "GET / HTTP/1.7", "GET /a b HTTP/1.1", "GET / HTTP/1.1\r\nno header"] {
+        let reply = answer_to(&server, format!("{head}\r\nhost: localhost\r\n\r\n").as_bytes()).await;
+        assert_eq!(
+            (reply.status, reply.reason().as_str(), reply.json()["field"].as_str()),
+            (400, "REQUEST_INVALID", Some("head")),
+            "{head}"
+        );
+    }
+    let head = "POST /v1/sessions HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json";
+    for body in ["transfer-encoding: chunked\r\n\r\nzz\r\n{}\r\n0\r\n\r\n", "transfer-encoding: chunked\r\n\r\n1\r\n{}0\r\n\r\n"] {
+        let reply = answer_to(&server, format!("{head}\r\n{body}").as_bytes()).await;
+        assert_eq!(
+            (reply.status, reply.reason().as_str(), reply.json()["field"].as_str()),
+            (400, "REQUEST_INVALID", Some("body")),
+            "{body}"
+        );
+    }
+}
+
+/// The server answered 413 and hung up on a client that was still sending: the system cut the connection, and the answer was lost.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_body_that_is_too_large_is_heard_out() {
+    let server = start(|_| {}).await;
+    let body = "0".repeat(12 << 20);
+    for framing in [
+        format!("content-length: {}\r\n\r\n{body}", body.len()),
+        format!("transfer-encoding: chunked\r\n\r\nc00000\r\n{body}\r\n0\r\n\r\n"),
+    ] {
+        let head = "POST /v1/sessions HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n";
+        let reply = answer_to(&server, format!("{head}{framing}").as_bytes()).await;
+        assert_eq!((reply.status, reply.reason().as_str(), reply.headers["connection"].as_bytes()), (413, "TOO_LARGE", &b"close"[..]));
+    }
+    // Whoever asks first need not send it.
+    let mut stream = TcpStream::connect(server.address).await.unwrap();
+    let head = "POST /v1/sessions HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\nexpect: 100-continue\r\ncontent-length:";
+    stream.write_all(format!("{head} 9999999\r\n\r\n").as_bytes()).await.unwrap();
+    assert_eq!(reply_of(&answer_of(&mut stream).await).reason(), "TOO_LARGE");
+}
+
+/// It is heard out to a bound in bytes and in time: what is more is cut.
+#[tokio::test(flavor = "multi_thread")]
+async fn nobody_is_heard_for_ever() {
+    let server = start(|config| {
+        config.limits.message_bytes_max = 2048;
+        config.connection.body_read_timeout_ms = 600;
+    })
+    .await;
+    let begun = async || {
+        let mut stream = TcpStream::connect(server.address).await.unwrap();
+        let head = "POST /v1/sessions HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: 999999999\r\n\r\n";
+        stream.write_all(head.as_bytes()).await.unwrap();
+        stream
+    };
+    let mut fast = begun().await;
+    let all = async { while fast.write_all(&[b'0'; 65_536]).await.is_ok() {} };
+    timeout(Duration::from_secs(5), all).await.expect("it reads for ever");
+    let mut slow = begun().await;
+    let all = async {
+        while slow.write_all(b"0").await.is_ok() {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    timeout(Duration::from_secs(5), all).await.expect("it waits for ever");
 }
 
 /// A client that cancels a lot is honest: its connection lives on.
@@ -145,19 +233,25 @@ async fn http2(address: SocketAddr) -> (hyper::client::conn::http2::SendRequest<
     (sender, tokio::spawn(async move { drop(connection.await) }))
 }
 
-/// Connections that only answered pings held their places for ever: 4,096 of them locked everyone out.
+/// Connections that only answered pings held their places for ever: 4,096 of them locked everyone out. So did streams that said nothing.
 #[tokio::test(flavor = "multi_thread")]
-async fn idle_connections_leave_and_streams_stay() {
+async fn idle_connections_leave_and_streams_that_work_stay() {
     let server = start(|config| config.connection.idle_timeout_ms = 300).await;
     let (sender, ended) = http2(server.address).await;
-    let mut agent = server.agent().await;
-    let stream = agent.act_stream(futures_util::stream::pending::<pb::ActRequest>()).await.unwrap();
+    let (mut silent, mut working) = (server.agent().await, server.agent().await);
+    let mut nothing = silent.act_stream(futures_util::stream::pending::<pb::ActRequest>()).await.unwrap().into_inner();
+    let slow = server.open(json!({"model": "slow"})).await;
+    let acts = futures_util::StreamExt::chain(futures_util::stream::iter([act(&slow, 1, &STATE)]), futures_util::stream::pending());
+    let _results = working.act_stream(acts).await.unwrap();
     timeout(Duration::from_secs(5), ended).await.expect("it holds its place").unwrap();
     drop(sender);
+    let idle = timeout(Duration::from_secs(5), nothing.message()).await.expect("it holds its place").unwrap_err();
+    assert_eq!((idle.code(), idle.message().contains("idle_timeout_ms")), (Code::Unavailable, true), "{idle:?}");
     tokio::time::sleep(Duration::from_millis(600)).await;
+    let session = server.get(&format!("/v1/sessions/{slow}")).await.json()["session"].clone();
+    assert_eq!(session["busy"], true, "an act in work is not idle");
     let id = server.open(json!({})).await;
-    assert_eq!(agent.act(act(&id, 1, &STATE)).await.unwrap().into_inner().step, 1, "the stream keeps its connection");
-    drop(stream);
+    assert_eq!(working.act(act(&id, 1, &STATE)).await.unwrap().into_inner().step, 1, "the stream keeps its connection");
 }
 
 /// Whoever asks and does not take the answers makes the server keep them.
@@ -165,13 +259,10 @@ async fn idle_connections_leave_and_streams_stay() {
 async fn answers_that_are_not_taken_cut_the_connection() {
     let server = start(|config| config.connection.write_timeout_ms = 300).await;
     let mut stream = TcpStream::connect(server.address).await.unwrap();
-    // More than the sockets on the way hold.
-    const ASKED: usize = 2_000;
-    let asking = stream.write_all("GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n\r\n".repeat(ASKED).into_bytes().leak());
-    let _not_all_is_taken = timeout(Duration::from_secs(2), asking).await;
-    tokio::time::sleep(Duration::from_millis(1500)).await;
-    let taken = answer_of(&mut stream).await.matches("HTTP/1.1 200").count();
-    assert!((1..ASKED).contains(&taken), "{taken}");
+    let some = "GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n\r\n".repeat(100);
+    // Until more waits than the sockets on the way hold, and the server gives up.
+    let asking = async { while stream.write_all(some.as_bytes()).await.is_ok() {} };
+    timeout(Duration::from_secs(20), asking).await.expect("it keeps the answers for ever");
     assert!(server.metric("ada_connections_timed_out_total").await >= 1.0);
 }
 
@@ -209,5 +300,6 @@ async fn one_address_does_not_take_all_places() {
     newcomer.write_all(b"connection: close\r\n\r\n").await.unwrap();
     assert!(answer_of(&mut newcomer).await.starts_with("HTTP/1.1 200"));
     let mut last = held.pop().unwrap();
-    assert!(answer_of(&mut last).await.starts_with("HTTP/1.1 503"));
+    let told = reply_of(&answer_of(&mut last).await);
+    assert_eq!((told.status, told.reason().as_str(), told.headers["retry-after"].as_bytes()), (503, "CONNECTIONS_FULL", &b"1"[..]));
 }

@@ -169,6 +169,8 @@ fn binary(settings: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ada-server"));
     command.args(["--default-model", "tiny", "--set", "telemetry.format=json", "--models"]).arg(models_dir());
     command.args(settings.iter().flat_map(|setting| ["--set", setting]));
+    // As in `config`: the model `slow` takes minutes for an act.
+    command.env("ADA__LIMITS__ACT_DEADLINE_MS", "3600000").env("ADA__LIMITS__ACT_DEADLINE_MS_MAX", "3600000");
     command.env("ADA__ENGINE__BATCH_LEN_MAX", "1").env_remove("RAYON_NUM_THREADS").env_remove("CANDLE_NUM_THREADS");
     command
 }

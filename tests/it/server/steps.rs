@@ -96,9 +96,10 @@ async fn the_patient_have_their_turn() {
     // Longer than `engine.turn_ms_max`.
     tokio::time::sleep(Duration::from_millis(400)).await;
     let mut hasty = Vec::new();
-    for _ in 0..3 {
+    // Each takes all the time it has, so the next one must have more to be let in.
+    for deadline_ms in [3_000, 10_000, 30_000] {
         let id = server.open(json!({"model": "slow"})).await;
-        let request = pb::ActRequest { deadline_ms: Some(3000), ..act(&id, 1, &STATE) };
+        let request = pb::ActRequest { deadline_ms: Some(deadline_ms), ..act(&id, 1, &STATE) };
         let mut agent = server.agent().await;
         hasty.push(tokio::spawn(async move { agent.act(request).await }));
     }

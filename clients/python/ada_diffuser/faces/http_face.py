@@ -22,6 +22,12 @@ from ada_diffuser.values import Floats
 
 T = TypeVar("T")
 
+#: A longer body is announced before it is sent: a server that finds it too large says so, and need not be sent all of it.
+_ANNOUNCED_LEN = 256 * 1024
+#: Who does not answer that in so long does not know how to.
+_ANNOUNCED_S = 1.0
+_CONTINUE = b"HTTP/1.1 100"
+
 
 class HttpFace:
     """A pool of connections, one for each call under way; safe to use from many threads."""
@@ -122,11 +128,7 @@ class HttpFace:
                 connection.connect()
             connection.sock.settimeout(_left(end))
             connection.response_class = partial(_Response, end=end)
-            refused = False
-            try:
-                connection.request(method, path, payload, headers)
-            except (BrokenPipeError, ConnectionResetError):
-                refused = True  # perhaps it was too large, and the answer that says so is there already
+            sent = _send(connection, method, path, payload, headers, end)
             response = connection.getresponse()
             text = response.read()
         except TimeoutError:
@@ -136,7 +138,7 @@ class HttpFace:
             connection.close()
             raise Unavailable(f"{self._host}:{self._port}: {error or type(error).__name__}") from None
         with self._lock:
-            kept = not (response.will_close or refused or self._closed)
+            kept = sent and not (response.will_close or self._closed)
             if kept:
                 self._idle.append(connection)
         if not kept:
@@ -153,6 +155,38 @@ class HttpFace:
             if connection.sock is not None and _is_alive(connection.sock):
                 return connection
             connection.close()
+
+
+def _send(
+    connection: http.client.HTTPConnection, method: str, path: str, payload: bytes | None, headers: Mapping[str, str], end: float
+) -> bool:
+    """Whether all of it was sent; if not, the answer that says why (it is too large, mostly) should be there."""
+    try:
+        if payload is None or len(payload) <= _ANNOUNCED_LEN:
+            connection.request(method, path, payload, headers)
+            return True
+        connection.putrequest(method, path)
+        for name, value in {**headers, "Content-Length": str(len(payload)), "Expect": "100-continue"}.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        if not _is_wanted(connection.sock, end):
+            return False
+        connection.send(payload)
+        return True
+    except (BrokenPipeError, ConnectionResetError):
+        return False
+
+
+def _is_wanted(sock: socket.socket, end: float) -> bool:
+    """Whether the server goes on to listen, or says nothing about it."""
+    sock.settimeout(min(_ANNOUNCED_S, _left(end)))
+    try:
+        said = sock.recv(len(_CONTINUE), socket.MSG_PEEK)
+    except TimeoutError:
+        return True
+    finally:
+        sock.settimeout(_left(end))
+    return bool(said) and _CONTINUE.startswith(said)
 
 
 class _Response(http.client.HTTPResponse):
