@@ -254,7 +254,7 @@ impl Default for EngineConfig {
             workers: 0,
             queue_len_max: 1024,
             queue_bytes_max: 64 << 20,
-            turn_ms_max: 200,
+            turn_ms_max: 100,
             wait_ms_max: 300,
             batch_len_max: 32,
             anytime: true,
