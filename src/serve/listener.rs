@@ -3,7 +3,7 @@
 use crate::serve::{
     config::Config,
     connections::{Activity, Place, Places, Verdict, look_interval},
-    grpc,
+    grpc::{self, endless},
     guard::Guard,
     http::Problem,
 };
@@ -60,6 +60,7 @@ pub struct Faces {
 #[derive(Clone)]
 pub struct Gate {
     _place: Arc<(Place, TaskTrackerToken)>,
+    leave: CancellationToken,
     hard_end: CancellationToken,
 }
 
@@ -85,8 +86,9 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
         match accepted {
             Ok((stream, peer)) => match places.take(peer.ip()) {
                 Some(place) => {
-                    let gate = Gate { _place: Arc::new((place, tracker.token())), hard_end: hard_end.clone() };
-                    tokio::spawn(connection(stream, faces.clone(), config.clone(), leave.clone(), gate));
+                    let held = Arc::new((place, tracker.token()));
+                    let gate = Gate { _place: held, leave: leave.clone(), hard_end: hard_end.clone() };
+                    tokio::spawn(connection(stream, faces.clone(), config.clone(), gate));
                 }
                 None => turn_away(stream),
             },
@@ -110,15 +112,15 @@ fn turn_away(mut stream: TcpStream) {
     tokio::spawn(async move { timeout(ACCEPT_PAUSE, stream.write_all(BUSY)).await });
 }
 
-async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, leave: CancellationToken, gate: Gate) {
+async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, gate: Gate) {
     metrics::gauge!("ada_connections").increment(1.0);
     let patience = Duration::from_millis(config.connection.preface_timeout_ms);
     let greeted = tokio::select! {
         greeted = timeout(patience, has_spoken(&stream)) => greeted,
-        () = leave.cancelled() => Ok(false),
+        () = gate.leave.cancelled() => Ok(false),
     };
     match greeted {
-        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &leave, &gate)).await,
+        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &gate)).await,
         Ok(false) => {}
         Err(_) => metrics::counter!("ada_connections_timed_out_total").increment(1),
     }
@@ -137,7 +139,7 @@ async fn has_spoken(stream: &TcpStream) -> bool {
     }
 }
 
-async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &CancellationToken, gate: &Gate) {
+async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate) {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "no TCP_NODELAY");
     }
@@ -154,7 +156,7 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &Cancella
     let ended = loop {
         tokio::select! {
             ended = connection.as_mut() => break ended,
-            () = leave.cancelled(), if !is_leaving => {
+            () = gate.leave.cancelled(), if !is_leaving => {
                 is_leaving = true;
                 connection.as_mut().graceful_shutdown();
             }
@@ -165,7 +167,7 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &Cancella
                     connection.as_mut().graceful_shutdown();
                 }
                 // One that was asked and does not go holds its place for nothing.
-                Verdict::Leave if !leave.is_cancelled() => break Ok(()),
+                Verdict::Leave if !gate.leave.is_cancelled() => break Ok(()),
                 Verdict::Cut => {
                     metrics::counter!("ada_connections_timed_out_total").increment(1);
                     break Ok(());
@@ -232,10 +234,14 @@ async fn answer(
     let (id, path) = (request_id(&request), request.uri().path().to_owned());
     let span = tracing::info_span!("request", %id, face, method = %request.method());
     let is_stream = is_grpc && grpc::is_stream(&path);
+    let leave = (is_grpc && endless::is_endless(&path)).then(|| gate.leave.clone());
     let mut request = request.map(|body| match is_grpc && !is_stream {
         true => Body::new(TimeoutBody::new(patience.body, body)),
         false => Body::new(body),
     });
+    if let Some(leave) = &leave {
+        request = request.map(|body| endless::requests(body, leave));
+    }
     request.extensions_mut().insert(gate);
     let refused = faces.guard.refuses(&request);
     let work = async move {
@@ -260,6 +266,9 @@ async fn answer(
     metrics::histogram!("ada_http_request_duration_seconds", "face" => face).record(begin.elapsed().as_secs_f64());
     if let Ok(id) = HeaderValue::from_str(&id) {
         response.headers_mut().insert(REQUEST_ID, id);
+    }
+    if let Some(leave) = &leave {
+        response = response.map(|body| endless::answers(body, leave));
     }
     let until = (!is_stream).then(|| Instant::now() + patience.write);
     Ok(response.map(|body| open.until_taken(body, until)))

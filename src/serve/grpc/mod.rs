@@ -1,6 +1,7 @@
 //! The gRPC face: messages in, messages out; the service does the rest.
 
 mod convert;
+pub mod endless;
 mod status;
 
 /// Code that the build makes from `proto/`.
@@ -183,7 +184,7 @@ impl models_server::Models for Face {
 
 /// Whether a method of this face is a stream, of requests or of answers.
 pub fn is_stream(path: &str) -> bool {
-    ["/ActStream", "/Watch", "/ServerReflectionInfo"].iter().any(|method| path.ends_with(method))
+    path.ends_with("/ActStream") || endless::is_endless(path)
 }
 
 /// Whether a request is meant for this face.
