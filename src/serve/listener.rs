@@ -1,11 +1,12 @@
 //! The one accept loop: both faces on one port, every connection bounded in time, and an end that comes.
 
 use crate::serve::{
-    config::Config,
-    connections::{Activity, Place, Places, Verdict, look_interval},
+    config::{Config, ConnectionConfig},
+    connections::{Activity, Asked, Given, Held, Kind, Place, Places, Verdict, look_interval},
     grpc::{self, endless},
     guard::Guard,
     http::Problem,
+    session::Untold,
 };
 use axum::{
     Router,
@@ -32,11 +33,14 @@ use tokio_util::{
     task::{TaskTracker, task_tracker::TaskTrackerToken},
 };
 use tower::ServiceExt;
-use tower_http::timeout::TimeoutBody;
 use tracing::Instrument;
 use uuid::Uuid;
 
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+/// Bytes of requests that an HTTP/2 connection may send before they are read. A megabyte, the stock value, times all connections is too much.
+const HTTP2_WINDOW: u32 = 128 << 10;
+/// Bytes of an HTTP/2 answer that wait for the socket. The stock value lets the 128 streams of a connection hold 50 MB.
+const HTTP2_SEND_BUFFER: usize = 64 << 10;
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 /// For one connection too many: REST clients understand it, gRPC clients see UNAVAILABLE.
 const BUSY: &[u8] = b"HTTP/1.1 503 Service Unavailable\r\nretry-after: 1\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
@@ -77,7 +81,7 @@ impl Gate {
 /// Serves both faces until `leave` is cancelled, then lets every request in flight end, for `server.drain_timeout_ms` at most.
 pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
     let (tracker, hard_end) = (TaskTracker::new(), CancellationToken::new());
-    let places = Places::new(&config.server);
+    let (places, held) = (Places::new(&config.server), Held::new(&config.server));
     loop {
         let accepted = tokio::select! {
             () = leave.cancelled() => break,
@@ -86,9 +90,9 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
         match accepted {
             Ok((stream, peer)) => match places.take(peer.ip()) {
                 Some(place) => {
-                    let held = Arc::new((place, tracker.token()));
-                    let gate = Gate { _place: held, leave: leave.clone(), hard_end: hard_end.clone() };
-                    tokio::spawn(connection(stream, faces.clone(), config.clone(), gate));
+                    let activity = held.begin(place.address(), Instant::now());
+                    let gate = Gate { _place: Arc::new((place, tracker.token())), leave: leave.clone(), hard_end: hard_end.clone() };
+                    tokio::spawn(connection(stream, faces.clone(), config.clone(), gate, activity));
                 }
                 None => turn_away(stream),
             },
@@ -112,7 +116,7 @@ fn turn_away(mut stream: TcpStream) {
     tokio::spawn(async move { timeout(ACCEPT_PAUSE, stream.write_all(BUSY)).await });
 }
 
-async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, gate: Gate) {
+async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, gate: Gate, activity: Arc<Activity>) {
     metrics::gauge!("ada_connections").increment(1.0);
     let patience = Duration::from_millis(config.connection.preface_timeout_ms);
     let greeted = tokio::select! {
@@ -120,7 +124,7 @@ async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, gate: 
         () = gate.leave.cancelled() => Ok(false),
     };
     match greeted {
-        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &gate)).await,
+        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &gate, &activity)).await,
         Ok(false) => {}
         Err(_) => metrics::counter!("ada_connections_timed_out_total").increment(1),
     }
@@ -139,11 +143,10 @@ async fn has_spoken(stream: &TcpStream) -> bool {
     }
 }
 
-async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate) {
+async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate, activity: &Arc<Activity>) {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "no TCP_NODELAY");
     }
-    let activity = Activity::new(Instant::now());
     let ms = Duration::from_millis;
     let patience = Patience { body: ms(config.connection.body_read_timeout_ms), write: ms(config.connection.write_timeout_ms) };
     let answer = service_fn(|request| answer(request, faces.clone(), gate.clone(), activity.clone(), patience));
@@ -152,6 +155,7 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate) {
     stream.set_write_timeout(Some(patience.write));
     let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(Box::pin(stream)), answer));
     let (mut looks, mut is_leaving) = (interval(look_interval(config)), false);
+    let mut of_age = pin!(sleep(age_max(&config.connection, activity.number)));
     let idle_max = Duration::from_millis(config.connection.idle_timeout_ms);
     let ended = loop {
         tokio::select! {
@@ -160,6 +164,11 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate) {
                 is_leaving = true;
                 connection.as_mut().graceful_shutdown();
             }
+            () = of_age.as_mut(), if !is_leaving => {
+                is_leaving = true;
+                connection.as_mut().graceful_shutdown();
+            }
+            () = activity.cut.cancelled() => break Ok(()),
             _ = looks.tick() => match activity.verdict(idle_max, Instant::now()) {
                 Verdict::Leave if !is_leaving => {
                     is_leaving = true;
@@ -184,6 +193,12 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate) {
     }
 }
 
+/// How old a connection may be: those that began together do not leave together.
+fn age_max(config: &ConnectionConfig, number: u64) -> Duration {
+    let scattered = number.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
+    Duration::from_millis(config.age_max_ms).mul_f64(0.9 + 0.2 * scattered as f64 / f64::from(u32::MAX))
+}
+
 /// Whether a piece of an answer was not taken in time.
 fn is_late(error: &(dyn Error + 'static)) -> bool {
     let is_cause = error.downcast_ref::<io::Error>().is_some_and(|error| error.kind() == io::ErrorKind::TimedOut);
@@ -193,7 +208,7 @@ fn is_late(error: &(dyn Error + 'static)) -> bool {
 /// How long the server waits for a client.
 #[derive(Clone, Copy)]
 struct Patience {
-    /// For the next piece of a unary gRPC request.
+    /// For a gRPC request, or a message of a stream, to be complete.
     body: Duration,
     /// For an answer to be taken: for each piece that the system does not take at once, and for all of it from its head on.
     write: Duration,
@@ -214,6 +229,9 @@ fn builder(config: &Config) -> auto::Builder<TokioExecutor> {
         .max_concurrent_streams(config.streams_max)
         .max_pending_accept_reset_streams(config.pending_resets_max)
         .max_header_list_size(config.header_bytes_max)
+        .initial_stream_window_size(HTTP2_WINDOW)
+        .initial_connection_window_size(HTTP2_WINDOW)
+        .max_send_buf_size(HTTP2_SEND_BUFFER)
         .keep_alive_interval(Duration::from_millis(config.keepalive_interval_ms))
         .keep_alive_timeout(Duration::from_millis(config.keepalive_timeout_ms));
     builder
@@ -227,7 +245,7 @@ async fn answer(
     activity: Arc<Activity>,
     patience: Patience,
 ) -> Result<Response<Body>, Infallible> {
-    let open = activity.begin();
+    let open = activity.open();
     let begin = Instant::now();
     let is_grpc = grpc::is_grpc(request.headers());
     let (face, router) = if is_grpc { ("grpc", faces.grpc) } else { ("http", faces.http) };
@@ -235,10 +253,12 @@ async fn answer(
     let span = tracing::info_span!("request", %id, face, method = %request.method());
     let is_stream = is_grpc && grpc::is_stream(&path);
     let leave = (is_grpc && endless::is_endless(&path)).then(|| gate.leave.clone());
-    let mut request = request.map(|body| match is_grpc && !is_stream {
-        true => Body::new(TimeoutBody::new(patience.body, body)),
-        false => Body::new(body),
-    });
+    let kind = match (is_grpc, is_stream) {
+        (true, true) => Kind::Messages,
+        (true, false) => Kind::Message,
+        (false, _) => Kind::Plain,
+    };
+    let mut request = request.map(|body| Body::new(Asked::new(Body::new(body), kind, patience.body, open.clone())));
     if let Some(leave) = &leave {
         request = request.map(|body| endless::requests(body, leave));
     }
@@ -271,7 +291,8 @@ async fn answer(
         response = response.map(|body| endless::answers(body, leave));
     }
     let until = (!is_stream).then(|| Instant::now() + patience.write);
-    Ok(response.map(|body| open.until_taken(body, until)))
+    let untold = response.extensions_mut().remove::<Arc<Untold>>();
+    Ok(response.map(|body| Body::new(Given::new(body, until, open, untold))))
 }
 
 /// The route as a label: never a path that a client made up.
