@@ -1,11 +1,12 @@
 //! The one accept loop: both faces on one port, every connection bounded in time, and an end that comes.
 
 use crate::serve::{
-    config::Config,
-    connections::{Activity, Place, Places, Verdict, look_interval},
-    grpc,
+    config::{Config, ConnectionConfig},
+    connections::{Activity, Asked, Given, Held, Kind, Place, Places, Verdict, look_interval},
+    grpc::{self, endless},
     guard::Guard,
     http::Problem,
+    session::Untold,
     wire::{Bounds, Watched, Wire},
 };
 use axum::{
@@ -41,11 +42,14 @@ use tokio_util::{
     task::{TaskTracker, task_tracker::TaskTrackerToken},
 };
 use tower::ServiceExt;
-use tower_http::timeout::TimeoutBody;
 use tracing::Instrument;
 use uuid::Uuid;
 
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+/// Bytes of requests that an HTTP/2 connection may send before they are read. A megabyte, the stock value, times all connections is too much.
+const HTTP2_WINDOW: u32 = 128 << 10;
+/// Bytes of an HTTP/2 answer that wait for the socket. The stock value lets the 128 streams of a connection hold 50 MB.
+const HTTP2_SEND_BUFFER: usize = 64 << 10;
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 /// What one connection too many is told to wait.
 const RETRY_AFTER_FULL_MS: u64 = 1_000;
@@ -70,6 +74,7 @@ pub struct Faces {
 pub struct Gate {
     _place: Arc<(Place, TaskTrackerToken)>,
     client: u64,
+    leave: CancellationToken,
     hard_end: CancellationToken,
     lingers: Arc<AtomicBool>,
 }
@@ -102,8 +107,7 @@ impl Gate {
 /// Serves both faces until `leave` is cancelled, then lets every request in flight end, for `server.drain_timeout_ms` at most.
 pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
     let (tracker, hard_end) = (TaskTracker::new(), CancellationToken::new());
-    let places = Places::new(&config.server);
-    let mut client = 0;
+    let (places, held) = (Places::new(&config.server), Held::new(&config.server));
     loop {
         let accepted = tokio::select! {
             () = leave.cancelled() => break,
@@ -112,10 +116,11 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
         match accepted {
             Ok((stream, peer)) => match places.take(peer.ip()) {
                 Some(place) => {
-                    client += 1;
-                    let (place, hard_end) = (Arc::new((place, tracker.token())), hard_end.clone());
-                    let gate = Gate { _place: place, client, hard_end, lingers: Arc::default() };
-                    tokio::spawn(connection(stream, faces.clone(), config.clone(), leave.clone(), gate));
+                    let activity = held.begin(place.address(), Instant::now());
+                    let (place, client) = (Arc::new((place, tracker.token())), activity.number);
+                    let (leave, hard_end) = (leave.clone(), hard_end.clone());
+                    let gate = Gate { _place: place, client, leave, hard_end, lingers: Arc::default() };
+                    tokio::spawn(connection(stream, faces.clone(), config.clone(), gate, activity));
                 }
                 None => turn_away(stream),
             },
@@ -148,15 +153,15 @@ fn turn_away(mut stream: TcpStream) {
     tokio::spawn(timeout(ACCEPT_PAUSE, tell));
 }
 
-async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, leave: CancellationToken, gate: Gate) {
+async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, gate: Gate, activity: Arc<Activity>) {
     metrics::gauge!("ada_connections").increment(1.0);
     let patience = Duration::from_millis(config.connection.preface_timeout_ms);
     let greeted = tokio::select! {
         greeted = timeout(patience, has_spoken(&stream)) => greeted,
-        () = leave.cancelled() => Ok(false),
+        () = gate.leave.cancelled() => Ok(false),
     };
     match greeted {
-        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &leave, &gate)).await,
+        Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &gate, &activity)).await,
         Ok(false) => {}
         Err(_) => metrics::counter!("ada_connections_timed_out_total").increment(1),
     }
@@ -175,11 +180,10 @@ async fn has_spoken(stream: &TcpStream) -> bool {
     }
 }
 
-async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &CancellationToken, gate: &Gate) {
+async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate, activity: &Arc<Activity>) {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "no TCP_NODELAY");
     }
-    let activity = Activity::new(Instant::now());
     let ms = Duration::from_millis;
     let patience = Patience { body: ms(config.connection.body_read_timeout_ms), write: ms(config.connection.write_timeout_ms) };
     let answer = service_fn(|request| answer(request, faces.clone(), gate.clone(), activity.clone(), patience));
@@ -187,22 +191,29 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &Cancella
     let wire = Wire::new(stream, gate.clone(), Bounds::new(config));
     let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(wire), answer));
     let (mut looks, mut is_leaving) = (interval(look_interval(config)), false);
-    let idle_max = Duration::from_millis(config.connection.idle_timeout_ms);
+    let mut of_age = pin!(sleep(age_max(&config.connection, activity.number)));
+    let [idle_max, leave_max] = [config.connection.idle_timeout_ms, config.connection.keepalive_timeout_ms].map(Duration::from_millis);
     let ended = loop {
         tokio::select! {
             ended = connection.as_mut() => break ended,
-            () = leave.cancelled(), if !is_leaving => {
+            () = gate.leave.cancelled(), if !is_leaving => {
                 is_leaving = true;
                 connection.as_mut().graceful_shutdown();
             }
-            _ = looks.tick() => match activity.verdict(idle_max, Instant::now()) {
+            () = of_age.as_mut(), if !is_leaving => {
+                is_leaving = true;
+                connection.as_mut().graceful_shutdown();
+            }
+            () = activity.cut.cancelled() => break Ok(()),
+            // One that was asked to leave and has nothing in hand need not stay for as long as others.
+            _ = looks.tick() => match activity.verdict(if is_leaving { leave_max } else { idle_max }, Instant::now()) {
                 Verdict::Leave if !is_leaving => {
                     is_leaving = true;
                     metrics::counter!("ada_connections_timed_out_total").increment(1);
                     connection.as_mut().graceful_shutdown();
                 }
                 // One that was asked and does not go holds its place for nothing.
-                Verdict::Leave if !leave.is_cancelled() => break Ok(()),
+                Verdict::Leave if !gate.leave.is_cancelled() => break Ok(()),
                 Verdict::Cut => {
                     metrics::counter!("ada_connections_timed_out_total").increment(1);
                     break Ok(());
@@ -219,6 +230,12 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, leave: &Cancella
     }
 }
 
+/// How old a connection may be: those that began together do not leave together.
+fn age_max(config: &ConnectionConfig, number: u64) -> Duration {
+    let scattered = number.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
+    Duration::from_millis(config.age_max_ms).mul_f64(0.9 + 0.2 * scattered as f64 / f64::from(u32::MAX))
+}
+
 /// Whether a piece of an answer was not taken in time.
 fn is_late(error: &(dyn Error + 'static)) -> bool {
     let is_cause = error.downcast_ref::<io::Error>().is_some_and(|error| error.kind() == io::ErrorKind::TimedOut);
@@ -228,7 +245,7 @@ fn is_late(error: &(dyn Error + 'static)) -> bool {
 /// How long the server waits for a client.
 #[derive(Clone, Copy)]
 struct Patience {
-    /// For the next piece of a unary gRPC request.
+    /// For a gRPC request, or a message of a stream, to be complete.
     body: Duration,
     /// For an answer to be taken: for each piece that the system does not take at once, and for all of it from its head on.
     write: Duration,
@@ -249,6 +266,9 @@ fn builder(config: &Config) -> auto::Builder<TokioExecutor> {
         .max_concurrent_streams(config.streams_max)
         .max_pending_accept_reset_streams(config.pending_resets_max)
         .max_header_list_size(config.header_bytes_max)
+        .initial_stream_window_size(HTTP2_WINDOW)
+        .initial_connection_window_size(HTTP2_WINDOW)
+        .max_send_buf_size(HTTP2_SEND_BUFFER)
         .keep_alive_interval(Duration::from_millis(config.keepalive_interval_ms))
         .keep_alive_timeout(Duration::from_millis(config.keepalive_timeout_ms));
     builder
@@ -262,7 +282,7 @@ async fn answer(
     activity: Arc<Activity>,
     patience: Patience,
 ) -> Result<Response<Body>, Infallible> {
-    let open = activity.begin();
+    let open = activity.open();
     let begin = Instant::now();
     let is_grpc = grpc::is_grpc(request.headers());
     let (face, router) = if is_grpc { ("grpc", faces.grpc) } else { ("http", faces.http) };
@@ -270,12 +290,19 @@ async fn answer(
     let span = tracing::info_span!("request", %id, face, method = %request.method());
     let is_stream = is_grpc && grpc::is_stream(&path);
     let is_http1 = request.version() < Version::HTTP_2;
-    let mut request = request.map(|body| match (is_http1, is_grpc && !is_stream) {
-        (true, false) => Body::new(Watched::new(body, gate.clone())),
-        (true, true) => Body::new(TimeoutBody::new(patience.body, Watched::new(body, gate.clone()))),
-        (false, true) => Body::new(TimeoutBody::new(patience.body, body)),
-        (false, false) => Body::new(body),
+    let leave = (is_grpc && endless::is_endless(&path)).then(|| gate.leave.clone());
+    let kind = match (is_grpc, is_stream) {
+        (true, true) => Kind::Messages,
+        (true, false) => Kind::Message,
+        (false, _) => Kind::Plain,
+    };
+    let mut request = request.map(|body| {
+        let body = if is_http1 { Body::new(Watched::new(body, gate.clone())) } else { Body::new(body) };
+        Body::new(Asked::new(body, kind, patience.body, open.clone()))
     });
+    if let Some(leave) = &leave {
+        request = request.map(|body| endless::requests(body, leave));
+    }
     request.extensions_mut().insert(gate.clone());
     let refused = faces.guard.refuses(&request);
     let work = async move {
@@ -304,8 +331,12 @@ async fn answer(
     if is_http1 && gate.lingers() && response.status() == StatusCode::PAYLOAD_TOO_LARGE {
         response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
     }
+    if let Some(leave) = &leave {
+        response = response.map(|body| endless::answers(body, leave));
+    }
     let until = (!is_stream).then(|| Instant::now() + patience.write);
-    Ok(response.map(|body| open.until_taken(body, until)))
+    let untold = response.extensions_mut().remove::<Arc<Untold>>();
+    Ok(response.map(|body| Body::new(Given::new(body, until, open, untold))))
 }
 
 /// The route as a label: never a path that a client made up.

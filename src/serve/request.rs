@@ -4,7 +4,8 @@ use crate::{
     model::agent::{LatentMode, Observation, SamplerOptions},
     serve::{
         error::ServiceError,
-        session::{Answer, Summary},
+        registry::Model,
+        session::{Answer, Summary, Untold},
     },
 };
 use std::{sync::Arc, time::Duration};
@@ -80,6 +81,16 @@ pub struct OpenRequest {
     pub request_id: String,
 }
 
+/// A session that was opened.
+pub struct Opened {
+    /// The session.
+    pub session: Summary,
+    /// Its model.
+    pub model: Model,
+    /// To travel with the answer. None where the request has a name: its client may come back for the session.
+    pub untold: Option<Arc<Untold>>,
+}
+
 /// ResetSession.
 #[derive(Clone, Debug, Default)]
 pub struct ResetRequest {
@@ -143,16 +154,19 @@ pub struct ActResult {
 pub struct ListRequest {
     /// 0: the default.
     pub page_size: usize,
-    /// Id of the last session of the page before; empty: from the beginning.
+    /// Handle of the last session of the page before; empty: from the beginning.
     pub page_token: String,
     /// Only of this model; empty: all.
     pub model: String,
+    /// Whether each session comes with its details. A list is short unless asked: its answer is the largest that a request of a few bytes gets,
+    /// and whoever does not take it makes the server hold it.
+    pub in_full: bool,
 }
 
 /// A page of sessions.
 #[derive(Debug)]
 pub struct Page {
-    /// In order of id.
+    /// In order of handle.
     pub sessions: Vec<Summary>,
     /// Empty on the last page.
     pub next_page_token: String,

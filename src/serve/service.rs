@@ -7,9 +7,9 @@ use crate::{
         engine::{Engine, EngineOptions, Failure, Job, Patience, Question, Refusal},
         error::{ServiceError, Stage},
         registry::{Model, Registry, RegistryError},
-        request::{ActRequest, ActResult, Acted, Caller, ListRequest, OpenRequest, Page, ResetRequest},
+        request::{ActRequest, ActResult, Acted, Caller, ListRequest, OpenRequest, Opened, Page, ResetRequest},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
-        session::{Answer, Entry, Opening, Session, Sessions, Summary, Waiter, key_of},
+        session::{Answer, Entry, Handle, Opening, Session, Sessions, Summary, Untold, Waiter, key_of},
         telemetry,
     },
 };
@@ -36,7 +36,7 @@ const PAGE_LEN_MAX: usize = 100;
 pub struct Service {
     config: Config,
     registry: OnceLock<Registry>,
-    sessions: Sessions,
+    sessions: Arc<Sessions>,
     engine: Engine<Seat>,
     draining: CancellationToken,
 }
@@ -51,7 +51,7 @@ impl Service {
         let [deadline_margin, wait_max] = [deadline_margin_ms, wait_ms_max].map(Duration::from_millis);
         let options = EngineOptions { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin, wait_max };
         let engine = Engine::start(options)?;
-        let sessions = Sessions::new(config.sessions.clone());
+        let sessions = Arc::new(Sessions::new(config.sessions.clone()));
         Ok(Self { config, registry: OnceLock::new(), sessions, engine, draining: CancellationToken::new() })
     }
 
@@ -158,17 +158,19 @@ impl Service {
     ///
     /// # Errors
     /// `ModelNotFound`, `Invalid`, `Quota`, `NotReady`, `Draining`.
-    pub fn open(&self, request: OpenRequest) -> Result<(Summary, Model), ServiceError> {
+    pub fn open(&self, request: OpenRequest) -> Result<Opened, ServiceError> {
         let OpenRequest { model, seed, options, ttl_ms, request_id } = request;
         check_request_id(&request_id)?;
         let model = self.model(&model)?;
         let ttl = self.ttl(ttl_ms)?;
         let options = options.onto(&model.agent.spec().sampler);
         let episode = model.agent.open(seed.unwrap_or_else(draw_seed), &options).map_err(ServiceError::from_agent)?;
+        let is_named = !request_id.is_empty();
         let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, options, ttl, request_id };
         let now = Instant::now();
         let session = self.sessions.open(opening, now)?;
-        Ok((session.summary(now), model))
+        let untold = (!is_named).then(|| Untold::new(self.sessions.clone(), session.clone()));
+        Ok(Opened { session: session.summary(now), model, untold })
     }
 
     /// Act.
@@ -253,17 +255,17 @@ impl Service {
     /// `Invalid` if the page token is none of ours.
     pub fn list(&self, request: &ListRequest) -> Result<Page, ServiceError> {
         let token = request.page_token.as_str();
-        let not_ours = |_| ServiceError::invalid("page_token", "is not a token of a page before");
-        let after = if token.is_empty() { None } else { Some(Uuid::try_parse(token).map_err(not_ours)?) };
+        let not_ours = || ServiceError::invalid("page_token", "is not a token of a page before");
+        let after = if token.is_empty() { None } else { Some(Handle::parse(token).ok_or_else(not_ours)?) };
         let model = (!request.model.is_empty()).then_some(request.model.as_str());
         let len = if request.page_size == 0 { PAGE_LEN } else { request.page_size.min(PAGE_LEN_MAX) };
         let mut found = self.sessions.page(after, model, len + 1);
         let more = found.len() > len;
         found.truncate(len);
         let last = found.last().filter(|_| more);
-        let next_page_token = last.map_or_else(String::new, |session| session.id.to_string());
+        let next_page_token = last.map_or_else(String::new, |session| session.handle.to_string());
         let now = Instant::now();
-        Ok(Page { sessions: found.iter().map(|session| session.summary(now)).collect(), next_page_token })
+        Ok(Page { sessions: found.iter().map(|session| session.listed(request.in_full, now)).collect(), next_page_token })
     }
 
     /// CloseSession.

@@ -137,7 +137,8 @@ def test_what_a_client_must_know(client: Client) -> None:
         summary = session.summary()
         assert (summary.committed_step, summary.ttl_ms, summary.model) == (1, 60_000, "tiny")
         assert np.array_equal(summary.latent_mean, chunk.latent_mean)
-        assert session.session_id in {other.session_id for other in client.sessions(model="tiny", page_size=1)}
+        listed = {other.handle: other.session_id for other in client.sessions(model="tiny", page_size=1)}
+        assert listed[session.summary().handle] == "", "a list is no right to use what it lists"
         again = client.attach(session.session_id)
         assert again.act(STATES[1]).step == 2
     with pytest.raises(NotFound):
@@ -297,11 +298,11 @@ def test_rollouts_are_the_same_by_both_faces_alone_and_in_a_batch(address: str) 
     returns = {}
     for name, (face, trial) in trials.items():
         with Client(f"{face}://{address}") as client:
-            before = {session.session_id for session in client.sessions()}
+            before = {session.handle for session in client.sessions()}
             result = evaluate(client, trial)
             returns[name] = result.returns.tolist()
             assert result.acts.acts == 2 * 200 / result.options.action_horizon and result.acts.replayed == 0
-            assert {session.session_id for session in client.sessions()} <= before, "a rollout closes its sessions"
+            assert {session.handle for session in client.sessions()} <= before, "a rollout closes its sessions"
     assert returns["grpc alone"] == returns["http alone"] == returns["batch"]
 
 
@@ -336,9 +337,9 @@ def test_an_open_or_reset_whose_answer_was_lost_is_done_once(client: Client, mon
 
     for verb in lost:
         monkeypatch.setattr(face, verb, losing(verb))
-    before = {session.session_id for session in client.sessions()}
+    before = {session.handle for session in client.sessions()}
     with client.open_session("tiny") as session:
-        assert {other.session_id for other in client.sessions()} - before == {session.session_id}
+        assert {other.handle for other in client.sessions()} - before == {session.summary().handle}
         session.act(STATES[0])
         session.reset(seed=9)
         assert session.summary().episode == 1 and session.act(STATES[0]).step == 1

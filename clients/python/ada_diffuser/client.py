@@ -150,7 +150,10 @@ class Client:
         return self._tried(lambda timeout_s: self._face.get_session(session_id, timeout_s))
 
     def sessions(self, model: str | None = "", page_size: int = 0) -> Iterator[SessionSummary]:
-        """All sessions, by id; page after page as they are consumed."""
+        """All sessions, page after page as they are consumed.
+
+        A list is no right to use what it lists: it tells the ``handle`` of each session, and no ``session_id``.
+        """
         name, size, token = _model_name(model), whole(page_size, "page_size", bits=32), ""
         while True:
             page, token = self._tried(

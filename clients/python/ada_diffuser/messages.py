@@ -249,7 +249,10 @@ class Model:
 class SessionSummary:
     """The state of a session on the server."""
 
+    #: Whoever knows it may use the session; empty in lists.
     session_id: str
+    #: The session's name in lists.
+    handle: str
     model: str
     model_digest: str
     seed: int

@@ -43,6 +43,9 @@ pub struct ServerConfig {
     pub connections_max: usize,
     /// Open connections from one address; the others find a place all the same.
     pub connections_per_address_max: usize,
+    /// Bytes of all requests that are on their way in, and of all answers that are not taken; beyond it connections are cut, those first that make
+    /// the server hold most for longest.
+    pub held_bytes_max: usize,
     /// From the signal to end until connections are asked to leave; new work is refused (DRAINING) and `/readyz` fails, so that everyone can learn of it.
     pub drain_notice_ms: u64,
     /// From then on to the hard end of what still runs.
@@ -61,12 +64,15 @@ pub struct ConnectionConfig {
     pub preface_timeout_ms: u64,
     /// Until a request's headers are complete (HTTP/1), the time between requests included.
     pub header_read_timeout_ms: u64,
-    /// Until a REST body is complete; between two pieces of a gRPC request that is no stream.
+    /// Until a request is complete, of either face; on a stream until a message is complete that has begun.
     pub body_read_timeout_ms: u64,
     /// Until an answer is taken, from its head on; then the connection is cut. Streams may take their time.
     pub write_timeout_ms: u64,
     /// A connection without any request, or a stream without any act, for so long is asked to leave, whatever pings it answers.
     pub idle_timeout_ms: u64,
+    /// A connection of this age, give or take a tenth, is asked to leave: what is in flight goes on, streams for as long as they like, and new
+    /// requests come by a new connection. So load spreads again where servers were added behind one name.
+    pub age_max_ms: u64,
     /// Bytes of all headers of a request.
     pub header_bytes_max: u32,
     /// Number of headers of a request (HTTP/1).
@@ -115,6 +121,8 @@ pub struct SessionsConfig {
     pub ttl_ms_max: u64,
     /// A session is evicted only when it was idle for so long.
     pub evict_idle_ms: u64,
+    /// One that nobody has asked for since it was opened gives its place when it is so old, before all others: opening alone takes nobody's place.
+    pub unused_idle_ms: u64,
     /// So long an ended session is answered with the reason of its end instead of "not found".
     pub tombstone_ttl_ms: u64,
     /// Ended sessions remembered; beyond it the oldest are forgotten.
@@ -193,6 +201,7 @@ impl Default for ServerConfig {
             io_threads: 0,
             connections_max: 4096,
             connections_per_address_max: 2048,
+            held_bytes_max: 16 << 20,
             drain_notice_ms: 250,
             drain_timeout_ms: 10_000,
             hosts: Vec::new(),
@@ -209,6 +218,7 @@ impl Default for ConnectionConfig {
             body_read_timeout_ms: 10_000,
             write_timeout_ms: 30_000,
             idle_timeout_ms: 300_000,
+            age_max_ms: 600_000,
             header_bytes_max: 16_384,
             headers_max: 64,
             streams_max: 128,
@@ -241,6 +251,7 @@ impl Default for SessionsConfig {
             ttl_ms: 600_000,
             ttl_ms_max: 86_400_000,
             evict_idle_ms: 60_000,
+            unused_idle_ms: 1_000,
             tombstone_ttl_ms: 600_000,
             tombstones_max: 100_000,
             reap_interval_ms: 1_000,
@@ -388,7 +399,7 @@ impl Config {
     }
 
     /// Settings that make no sense as 0.
-    fn positive(&self) -> [(&'static str, u64); 28] {
+    fn positive(&self) -> [(&'static str, u64); 30] {
         let (connection, limits, sessions, engine) = (&self.connection, &self.limits, &self.sessions, &self.engine);
         [
             ("server.connections_max", self.server.connections_max as u64),
@@ -396,6 +407,8 @@ impl Config {
             ("server.connections_per_address_max", self.server.connections_per_address_max as u64),
             ("connection.write_timeout_ms", connection.write_timeout_ms),
             ("connection.idle_timeout_ms", connection.idle_timeout_ms),
+            ("connection.age_max_ms", connection.age_max_ms),
+            ("server.held_bytes_max", self.server.held_bytes_max as u64),
             ("connection.header_read_timeout_ms", connection.header_read_timeout_ms),
             ("connection.body_read_timeout_ms", connection.body_read_timeout_ms),
             ("connection.headers_max", connection.headers_max as u64),

@@ -12,8 +12,8 @@ mod tick;
 mod worker;
 
 use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode, Observation};
-use parking_lot::Mutex;
 use cost::Tariff;
+use parking_lot::Mutex;
 use queue::{Ask, Bounds, Place, Queue};
 use std::{
     sync::{
@@ -273,14 +273,8 @@ impl<T: Ticket> Shared<T> {
     /// What an act asks of the queue; None: it would come too late without any wait. Of a model that was never measured nothing is known.
     fn ask(&self, job: &Job<T>) -> Option<Ask> {
         let bytes = size_of::<Job<T>>() + job.question.observation.size_bytes() + job.descent.size_bytes();
-        let ask = Ask {
-            turn_by: job.turn_by,
-            client: job.client,
-            work: Duration::ZERO,
-            bytes,
-            wait_max: Duration::MAX,
-            useful: Duration::MAX,
-        };
+        let ask =
+            Ask { turn_by: job.turn_by, client: job.client, work: Duration::ZERO, bytes, wait_max: Duration::MAX, useful: Duration::MAX };
         let Some(costs) = self.tariff.of(&job.agent) else { return Some(ask) };
         let (evaluations, patience) = (job.descent.evaluations_left(), job.ticket.patience());
         let ((waiting, running), (_, slowness)) = (self.queue.load(), self.queue.expected_wait());

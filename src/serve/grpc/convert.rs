@@ -10,7 +10,7 @@ use crate::{
         error::ServiceError,
         registry::Model,
         request::{ActRequest, ActResult, Acted, Caller, Face, ListRequest, OpenRequest, OptionsPatch, ResetRequest},
-        session::{Answer, Summary, Timings},
+        session::{Answer, Detail, Summary, Timings},
     },
 };
 use std::time::Duration;
@@ -72,9 +72,14 @@ fn observation(observation: pb::Observation) -> Observation {
     Observation { state, executed: executed.collect(), nothing_executed }
 }
 
-pub fn list_request(request: pb::ListSessionsRequest) -> ListRequest {
-    let pb::ListSessionsRequest { page_size, page_token, model } = request;
-    ListRequest { page_size: page_size as usize, page_token, model }
+pub fn list_request(request: pb::ListSessionsRequest) -> Checked<ListRequest> {
+    let pb::ListSessionsRequest { page_size, page_token, model, view } = request;
+    let in_full = match pb::SessionView::try_from(view) {
+        Ok(pb::SessionView::Unspecified | pb::SessionView::Basic) => false,
+        Ok(pb::SessionView::Full) => true,
+        Err(_) => return Err(ServiceError::invalid("view", format!("{view} is neither SESSION_VIEW_BASIC nor SESSION_VIEW_FULL"))),
+    };
+    Ok(ListRequest { page_size: page_size as usize, page_token, model, in_full })
 }
 
 pub fn act_response(acted: &Acted) -> pb::ActResponse {
@@ -143,17 +148,21 @@ fn error(error: &ServiceError) -> pb::Error {
 }
 
 pub fn session(summary: Summary) -> pb::Session {
-    let Summary { id, model, model_digest, seed, committed_step, episode, options, latent, age, idle, ttl, state_bytes, busy } = summary;
+    let Summary { id, handle, model, committed_step, episode, detail, age, idle, ttl, state_bytes, busy } = summary;
+    let (model_digest, seed, options, latent) = match detail {
+        Some(Detail { model_digest, seed, options, latent }) => (model_digest, seed, Some(sampler_options(&options)), latent),
+        None => Default::default(),
+    };
     let (latent_mean, latent_log_var) = latent.unwrap_or_default();
     let ms = |time: Duration| time.as_millis() as u64;
     pb::Session {
-        session_id: id.to_string(),
+        session_id: id.map(|id| id.to_string()).unwrap_or_default(),
         model: model.to_string(),
         model_digest,
         seed,
         committed_step,
         episode,
-        options: Some(sampler_options(&options)),
+        options,
         latent_mean,
         latent_log_var,
         age_ms: ms(age),
@@ -161,6 +170,7 @@ pub fn session(summary: Summary) -> pb::Session {
         ttl_ms: ms(ttl),
         state_bytes: state_bytes as u64,
         busy,
+        handle: handle.to_string(),
     }
 }
 

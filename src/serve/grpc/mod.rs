@@ -1,6 +1,7 @@
 //! The gRPC face: messages in, messages out; the service does the rest.
 
 mod convert;
+pub mod endless;
 mod status;
 
 /// Code that the build makes from `proto/`.
@@ -14,7 +15,7 @@ pub mod pb {
 use crate::serve::{
     error::{ServiceError, Stage},
     listener::Gate,
-    request::ActResult,
+    request::{ActResult, Opened},
     service::{Idle, Service},
 };
 use axum::{http::HeaderMap, middleware, response::Response as HttpResponse};
@@ -74,12 +75,21 @@ fn ours(response: HttpResponse, limit: usize) -> HttpResponse {
 }
 
 fn unreadable(code: Code, limit: usize) -> ServiceError {
-    if code == Code::OutOfRange {
-        metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
-        ServiceError::TooLarge { what: "bytes of a message", limit }
-    } else {
-        ServiceError::invalid("message", "is not the protobuf message that belongs here")
+    match code {
+        Code::OutOfRange => {
+            metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
+            ServiceError::TooLarge { what: "bytes of a message", limit }
+        }
+        Code::DeadlineExceeded => LATE,
+        _ => ServiceError::invalid("message", "is not the protobuf message that belongs here"),
     }
+}
+
+const LATE: ServiceError = ServiceError::Deadline { stage: Stage::Admission };
+
+/// What becomes of a request that is not complete in time.
+pub fn late() -> Status {
+    refuse(LATE)
 }
 
 fn refuse(error: ServiceError) -> Status {
@@ -113,8 +123,11 @@ impl agent_server::Agent for Face {
 
     async fn open_session(&self, request: Request<pb::OpenSessionRequest>) -> Answer<pb::OpenSessionResponse> {
         let request = convert::open_request(request.into_inner()).map_err(refuse)?;
-        let (session, model) = self.0.open(request).map_err(refuse)?;
-        Ok(Response::new(pb::OpenSessionResponse { session: Some(convert::session(session)), model: Some(convert::model(&model)) }))
+        let Opened { session, model, untold } = self.0.open(request).map_err(refuse)?;
+        let answer = pb::OpenSessionResponse { session: Some(convert::session(session)), model: Some(convert::model(&model)) };
+        let mut response = Response::new(answer);
+        untold.map(|untold| response.extensions_mut().insert(untold));
+        Ok(response)
     }
 
     async fn act(&self, request: Request<pb::ActRequest>) -> Answer<pb::ActResponse> {
@@ -161,7 +174,7 @@ impl agent_server::Agent for Face {
     }
 
     async fn list_sessions(&self, request: Request<pb::ListSessionsRequest>) -> Answer<pb::ListSessionsResponse> {
-        let page = self.0.list(&convert::list_request(request.into_inner())).map_err(refuse)?;
+        let page = self.0.list(&convert::list_request(request.into_inner()).map_err(refuse)?).map_err(refuse)?;
         let sessions = page.sessions.into_iter().map(convert::session).collect();
         Ok(Response::new(pb::ListSessionsResponse { sessions, next_page_token: page.next_page_token }))
     }
@@ -190,7 +203,7 @@ impl models_server::Models for Face {
 
 /// Whether a method of this face is a stream, of requests or of answers.
 pub fn is_stream(path: &str) -> bool {
-    ["/ActStream", "/Watch", "/ServerReflectionInfo"].iter().any(|method| path.ends_with(method))
+    path.ends_with("/ActStream") || endless::is_endless(path)
 }
 
 /// Whether a request is meant for this face.

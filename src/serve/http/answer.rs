@@ -9,7 +9,7 @@ use crate::{
     serve::{
         registry::Model,
         request::{ActResult, Acted},
-        session::{Answer, Summary, Timings},
+        session::{Answer, Detail, Summary, Timings},
     },
 };
 use serde::Serialize;
@@ -125,16 +125,17 @@ pub struct BatchAnswer {
 /// A session in numbers.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct SessionAnswer {
-    session_id: String,
+    /// Whoever knows it may use the session. Absent in lists.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    session_id: Option<String>,
+    /// The session's name in lists, made one way from its id.
+    handle: String,
     model: String,
-    model_digest: String,
-    seed: u64,
     committed_step: u64,
     /// How often it was reset.
     episode: u64,
-    options: OptionsBody,
-    latent_mean: Vec<f32>,
-    latent_log_var: Vec<f32>,
+    #[serde(flatten)]
+    detail: Option<DetailAnswer>,
     age_ms: u64,
     idle_ms: u64,
     ttl_ms: u64,
@@ -143,22 +144,36 @@ pub struct SessionAnswer {
     busy: bool,
 }
 
+/// What a short list leaves out.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct DetailAnswer {
+    model_digest: String,
+    /// Seed of the running episode.
+    seed: u64,
+    options: OptionsBody,
+    latent_mean: Vec<f32>,
+    latent_log_var: Vec<f32>,
+}
+
+impl From<Detail> for DetailAnswer {
+    fn from(detail: Detail) -> Self {
+        let Detail { model_digest, seed, options, latent } = detail;
+        let (latent_mean, latent_log_var) = latent.unwrap_or_default();
+        Self { model_digest, seed, options: (&options).into(), latent_mean, latent_log_var }
+    }
+}
+
 impl From<Summary> for SessionAnswer {
     fn from(summary: Summary) -> Self {
-        let Summary { id, model, model_digest, seed, committed_step, episode, options, latent, age, idle, ttl, state_bytes, busy } =
-            summary;
-        let (latent_mean, latent_log_var) = latent.unwrap_or_default();
+        let Summary { id, handle, model, committed_step, episode, detail, age, idle, ttl, state_bytes, busy } = summary;
         let ms = |time: Duration| time.as_millis() as u64;
         Self {
-            session_id: id.to_string(),
+            session_id: id.map(|id| id.to_string()),
+            handle: handle.to_string(),
             model: model.to_string(),
-            model_digest,
-            seed,
             committed_step,
             episode,
-            options: (&options).into(),
-            latent_mean,
-            latent_log_var,
+            detail: detail.map(Into::into),
             age_ms: ms(age),
             idle_ms: ms(idle),
             ttl_ms: ms(ttl),

@@ -171,6 +171,20 @@ pub struct ListQuery {
     pub page_token: String,
     /// Only sessions of this model.
     pub model: String,
+    /// How much is told of each session.
+    #[param(inline)]
+    pub view: View,
+}
+
+/// How much a list tells of each session.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum View {
+    /// Without `model_digest`, `seed`, `options` and latents.
+    #[default]
+    Basic,
+    /// Everything but `session_id`.
+    Full,
 }
 
 impl From<OpenBody> for OpenRequest {

@@ -4,14 +4,14 @@ use super::{
     Gate, State,
     answer::{ActAnswer, BatchAnswer, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer},
     body::{bytes, parse, unfitting},
-    json::{ActBody, BatchBody, ListQuery, OpenBody, ResetBody},
+    json::{ActBody, BatchBody, ListQuery, OpenBody, ResetBody, View},
     problem::Problem,
     stream,
 };
 use crate::serve::{
     error::ServiceError,
     guard,
-    request::{ActResult, ListRequest},
+    request::{ActResult, ListRequest, Opened},
 };
 use axum::{
     Extension, Json, Router,
@@ -29,6 +29,9 @@ use hyper::body::Body as _;
 use serde::de::DeserializeOwned;
 use utoipa::OpenApi;
 use utoipa_axum::{router::OpenApiRouter, routes};
+
+/// Bytes that a WebSocket reads at a time; larger messages come in several.
+const READ_BUFFER_LEN: usize = 8 << 10;
 
 type Answer<T> = Result<Json<T>, Problem>;
 
@@ -131,18 +134,19 @@ async fn read<T: DeserializeOwned>(body: Body, state: &State) -> Result<T, Probl
 
 /// OpenSession
 #[utoipa::path(post, path = "/v1/sessions", request_body = OpenBody, responses((status = 201, description = "The session and its model", body = OpenAnswer), Problem))]
-async fn open_session(Shared(state): Shared<State>, body: Body) -> Result<(StatusCode, Json<OpenAnswer>), Problem> {
+async fn open_session(Shared(state): Shared<State>, body: Body) -> Result<Response, Problem> {
     let request: OpenBody = read(body, &state).await?;
-    let (session, model) = state.service.open(request.into())?;
-    Ok((StatusCode::CREATED, Json(OpenAnswer { session: session.into(), model: (&model).into() })))
+    let Opened { session, model, untold } = state.service.open(request.into())?;
+    let answer = (StatusCode::CREATED, Json(OpenAnswer { session: session.into(), model: (&model).into() }));
+    Ok((untold.map(Extension), answer).into_response())
 }
 
 /// ListSessions
-#[utoipa::path(get, path = "/v1/sessions", params(ListQuery), responses((status = 200, description = "A page of sessions, by id", body = ManySessions), Problem))]
+#[utoipa::path(get, path = "/v1/sessions", params(ListQuery), responses((status = 200, description = "A page of sessions, by handle", body = ManySessions), Problem))]
 async fn list_sessions(Shared(state): Shared<State>, query: Result<Query<ListQuery>, QueryRejection>) -> Answer<ManySessions> {
     let Query(query) = query.map_err(|error| misread_query(&error))?;
-    let ListQuery { page_size, page_token, model } = query;
-    let page = state.service.list(&ListRequest { page_size, page_token, model })?;
+    let ListQuery { page_size, page_token, model, view } = query;
+    let page = state.service.list(&ListRequest { page_size, page_token, model, in_full: view == View::Full })?;
     let sessions = page.sessions.into_iter().map(Into::into).collect();
     Ok(Json(ManySessions { sessions, next_page_token: page.next_page_token }))
 }
@@ -194,7 +198,8 @@ async fn act_stream(
     state.service.accepts()?;
     state.service.get(&id)?;
     let limit = state.service.config().limits.message_bytes_max;
-    let upgrade = upgrade.max_message_size(limit).max_frame_size(limit);
+    // The stock buffer is allocated at once, 128 KiB for each socket, whether or not it ever says a word.
+    let upgrade = upgrade.max_message_size(limit).max_frame_size(limit).read_buffer_size(READ_BUFFER_LEN);
     Ok(upgrade.on_upgrade(move |socket| stream::serve(socket, state, id, gate)))
 }
 

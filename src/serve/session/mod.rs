@@ -1,10 +1,14 @@
 //! One session: an episode as a value, the last committed answer, and at most one act in flight. The step protocol stands here: same step, same answer.
 
 mod flight;
+mod handle;
 mod table;
+mod untold;
 
 pub use flight::{Flight, Waiter};
+pub use handle::Handle;
 pub use table::Sessions;
+pub use untold::Untold;
 
 use crate::{
     model::agent::{Agent, Chunk, Episode, Executed, Observation, SamplerOptions},
@@ -81,6 +85,8 @@ pub struct Opening {
 pub struct Session {
     /// Random, 122 bits: knowing it is the right to use it.
     pub id: Uuid,
+    /// Its name in lists, which is no right to anything.
+    pub handle: Handle,
     /// Name of the model.
     pub model: Arc<str>,
     /// The model itself: a session keeps the weights it was opened on.
@@ -98,6 +104,8 @@ pub struct Session {
 
 struct Slot {
     touched: Instant,
+    /// Whether anybody has asked for it since it was opened.
+    used: bool,
     /// How often the session was reset: the number of the running episode.
     resets: u64,
     /// Names of the last requests that reset it.
@@ -133,22 +141,18 @@ pub enum Entry {
 /// A session in numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Summary {
-    /// Its id.
-    pub id: Uuid,
+    /// Its id, for those who know it: no list tells it.
+    pub id: Option<Uuid>,
+    /// Its name in lists.
+    pub handle: Handle,
     /// Name of the model.
     pub model: Arc<str>,
-    /// Digest of the model.
-    pub model_digest: String,
-    /// Seed of the running episode.
-    pub seed: u64,
     /// Acts committed in the running episode.
     pub committed_step: u64,
     /// How often it was reset.
     pub episode: u64,
-    /// Options in force.
-    pub options: SamplerOptions,
-    /// Latent mean and log-variance after the last act.
-    pub latent: Option<(Vec<f32>, Vec<f32>)>,
+    /// What a short list leaves out.
+    pub detail: Option<Detail>,
     /// Since it was opened.
     pub age: Duration,
     /// Since it was touched.
@@ -161,13 +165,34 @@ pub struct Summary {
     pub busy: bool,
 }
 
+/// What takes room in a summary.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Detail {
+    /// Digest of the model.
+    pub model_digest: String,
+    /// Seed of the running episode.
+    pub seed: u64,
+    /// Options in force.
+    pub options: SamplerOptions,
+    /// Latent mean and log-variance after the last act.
+    pub latent: Option<(Vec<f32>, Vec<f32>)>,
+}
+
 impl Session {
     fn new(opening: Opening, bytes_total: Arc<AtomicUsize>, now: Instant) -> Self {
         let Opening { model, agent, episode, options, ttl, request_id } = opening;
         bytes_total.fetch_add(episode.size_bytes(), Ordering::Relaxed);
-        let slot =
-            Slot { touched: now, resets: 0, reset_ids: VecDeque::new(), committed: Committed::fresh(episode), flight: None, ended: false };
-        Self { id: Uuid::new_v4(), model, agent, options, request_id, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
+        let slot = Slot {
+            touched: now,
+            used: false,
+            resets: 0,
+            reset_ids: VecDeque::new(),
+            committed: Committed::fresh(episode),
+            flight: None,
+            ended: false,
+        };
+        let id = Uuid::new_v4();
+        Self { id, handle: Handle::of(id), model, agent, options, request_id, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
     }
 
     /// Takes up a step, of this episode if one is named: replays, joins or leads it, for a caller who has this patience.
@@ -279,19 +304,28 @@ impl Session {
         Ok(())
     }
 
-    /// The session in numbers.
+    /// The session in numbers, for whoever knows its id.
     pub fn summary(&self, now: Instant) -> Summary {
+        Summary { id: Some(self.id), ..self.listed(true, now) }
+    }
+
+    /// The session in numbers, for everyone.
+    pub fn listed(&self, in_full: bool, now: Instant) -> Summary {
         let slot = self.slot.lock();
         let episode = &slot.committed.episode;
-        Summary {
-            id: self.id,
-            model: self.model.clone(),
+        let detail = || Detail {
             model_digest: self.agent.spec().digest.clone(),
             seed: episode.seed(),
-            committed_step: slot.committed.step,
-            episode: slot.resets,
             options: self.options.clone(),
             latent: episode.latent().map(|(mean, log_var)| (mean.to_vec(), log_var.to_vec())),
+        };
+        Summary {
+            id: None,
+            handle: self.handle,
+            model: self.model.clone(),
+            committed_step: slot.committed.step,
+            episode: slot.resets,
+            detail: in_full.then(detail),
             age: now.saturating_duration_since(self.opened),
             idle: now.saturating_duration_since(slot.touched),
             ttl: self.ttl,
@@ -300,8 +334,16 @@ impl Session {
         }
     }
 
-    fn touch(&self, now: Instant) {
-        self.slot.lock().touched = now;
+    /// Notes that somebody asks for it; says whether nobody had before.
+    fn touch(&self, now: Instant) -> bool {
+        let mut slot = self.slot.lock();
+        slot.touched = now;
+        !std::mem::replace(&mut slot.used, true)
+    }
+
+    /// Whether nobody has asked for it since it was opened.
+    fn is_unused(&self) -> bool {
+        !self.slot.lock().used
     }
 
     /// When it was last touched, if no act is in flight.

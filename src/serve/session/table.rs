@@ -3,7 +3,7 @@
 use crate::serve::{
     config::SessionsConfig,
     error::ServiceError,
-    session::{Opening, Session},
+    session::{Handle, Opening, Session},
 };
 use parking_lot::Mutex;
 use std::{
@@ -44,10 +44,14 @@ impl Ending {
     }
 }
 
-/// The table. Locks are taken in the order shard, slot; those of `idle` and `opened` come last, and hold nothing else. All are held for moments.
+/// The table. Locks are taken in the order shard, slot; those of `idle`, `unused` and `opened` come last, and hold nothing
+/// else. All are held for moments.
 pub struct Sessions {
     shards: [Mutex<Shard>; SHARDS],
+    /// Those that were asked for.
     idle: Mutex<Idle>,
+    /// Those that nobody has asked for since they were opened.
+    unused: Mutex<Idle>,
     /// Live sessions by the name of the request that opened them.
     opened: Mutex<HashMap<String, Uuid>>,
     len: AtomicUsize,
@@ -57,35 +61,35 @@ pub struct Sessions {
 
 #[derive(Default)]
 struct Shard {
-    live: BTreeMap<Uuid, Arc<Session>>,
-    ended: HashMap<Uuid, Ending>,
+    live: BTreeMap<Handle, Arc<Session>>,
+    ended: HashMap<Handle, Ending>,
     /// The same, oldest first.
-    endings: VecDeque<(Instant, Uuid)>,
+    endings: VecDeque<(Instant, Handle)>,
 }
 
 /// Live sessions by a time since which each may have been idle: not later than its last touch, so that an act need not come here. The first
 /// one is looked at before it is evicted, and filed anew if it was touched since.
 #[derive(Default)]
 struct Idle {
-    order: BTreeSet<(Instant, Uuid)>,
-    filed: HashMap<Uuid, Instant>,
+    order: BTreeSet<(Instant, Handle)>,
+    filed: HashMap<Handle, Instant>,
 }
 
 impl Idle {
-    fn file(&mut self, id: Uuid, since: Instant) {
-        self.forget(id);
-        self.filed.insert(id, since);
-        self.order.insert((since, id));
+    fn file(&mut self, handle: Handle, since: Instant) {
+        self.forget(handle);
+        self.filed.insert(handle, since);
+        self.order.insert((since, handle));
     }
 
-    fn forget(&mut self, id: Uuid) {
-        if let Some(since) = self.filed.remove(&id) {
-            self.order.remove(&(since, id));
+    fn forget(&mut self, handle: Handle) {
+        if let Some(since) = self.filed.remove(&handle) {
+            self.order.remove(&(since, handle));
         }
     }
 
     /// The one that may have been idle for longest, if it may have been for so long.
-    fn first(&self, idle_min: Duration, now: Instant) -> Option<(Instant, Uuid)> {
+    fn first(&self, idle_min: Duration, now: Instant) -> Option<(Instant, Handle)> {
         self.order.first().filter(|(since, _)| now.saturating_duration_since(*since) >= idle_min).copied()
     }
 }
@@ -96,6 +100,7 @@ impl Sessions {
         Self {
             shards: Default::default(),
             idle: Mutex::default(),
+            unused: Mutex::default(),
             opened: Mutex::default(),
             len: AtomicUsize::new(0),
             bytes: Arc::default(),
@@ -159,8 +164,8 @@ impl Sessions {
             self.evict(now)?;
         }
         let session = Arc::new(Session::new(opening, self.bytes.clone(), now));
-        self.shard(session.id).lock().live.insert(session.id, session.clone());
-        self.idle.lock().file(session.id, now);
+        self.shard(session.handle).lock().live.insert(session.handle, session.clone());
+        self.unused.lock().file(session.handle, now);
         metrics::counter!("ada_sessions_created_total").increment(1);
         Ok(session)
     }
@@ -170,16 +175,20 @@ impl Sessions {
     /// # Errors
     /// If there is none of this id, or if it ended by itself not long ago.
     pub fn get(&self, id: Uuid, now: Instant) -> Result<Arc<Session>, ServiceError> {
-        let mut shard = self.shard(id).lock();
-        if let Some(session) = shard.live.get(&id).cloned() {
+        let handle = Handle::of(id);
+        let mut shard = self.shard(handle).lock();
+        if let Some(session) = shard.live.get(&handle).cloned() {
             if session.end_if_idle(session.ttl, now) {
-                self.bury(&mut shard, id, Ending::Expired, now);
+                self.bury(&mut shard, handle, Ending::Expired, now);
                 return Err(ServiceError::SessionExpired);
             }
-            session.touch(now);
+            if session.touch(now) {
+                self.unused.lock().forget(handle);
+                self.idle.lock().file(handle, now);
+            }
             return Ok(session);
         }
-        Err(shard.ended.get(&id).map_or(ServiceError::SessionNotFound, |ending| ending.error()))
+        Err(shard.ended.get(&handle).map_or(ServiceError::SessionNotFound, |ending| ending.error()))
     }
 
     /// Ends a session; an act in flight is dropped.
@@ -188,7 +197,7 @@ impl Sessions {
     /// As [`Sessions::get`].
     pub fn close(&self, id: Uuid, now: Instant) -> Result<(), ServiceError> {
         let session = self.get(id, now)?;
-        if self.shard(id).lock().live.remove(&id).is_none() {
+        if self.shard(session.handle).lock().live.remove(&session.handle).is_none() {
             return Err(ServiceError::SessionNotFound);
         }
         self.forget(&session);
@@ -197,8 +206,18 @@ impl Sessions {
         Ok(())
     }
 
-    /// Up to `len` sessions with ids above `after`, in order of id.
-    pub fn page(&self, after: Option<Uuid>, model: Option<&str>, len: usize) -> Vec<Arc<Session>> {
+    /// Ends a session, unless somebody has asked for it since it was opened: then its id is known.
+    pub fn undo(&self, session: &Session) {
+        let mut shard = self.shard(session.handle).lock();
+        if session.is_unused() && shard.live.remove(&session.handle).is_some() {
+            self.forget(session);
+            session.end();
+            metrics::counter!("ada_sessions_ended_total", "reason" => "undone").increment(1);
+        }
+    }
+
+    /// Up to `len` sessions with handles above `after`, in order of handle.
+    pub fn page(&self, after: Option<Handle>, model: Option<&str>, len: usize) -> Vec<Arc<Session>> {
         let behind = after.map_or(Bound::Unbounded, Bound::Excluded);
         let mut found: Vec<_> = Vec::new();
         for shard in &self.shards {
@@ -206,7 +225,7 @@ impl Sessions {
             let sessions = shard.live.range((behind, Bound::Unbounded)).map(|(_, session)| session);
             found.extend(sessions.filter(|session| model.is_none_or(|model| *session.model == *model)).take(len).cloned());
         }
-        found.sort_unstable_by_key(|session| session.id);
+        found.sort_unstable_by_key(|session| session.handle);
         found.truncate(len);
         found
     }
@@ -216,9 +235,9 @@ impl Sessions {
         for shard in &self.shards {
             let mut shard = shard.lock();
             let expired = |session: &&Arc<Session>| session.end_if_idle(session.ttl, now);
-            let ids: Vec<_> = shard.live.values().filter(expired).map(|session| session.id).collect();
-            for id in ids {
-                self.bury(&mut shard, id, Ending::Expired, now);
+            let handles: Vec<_> = shard.live.values().filter(expired).map(|session| session.handle).collect();
+            for handle in handles {
+                self.bury(&mut shard, handle, Ending::Expired, now);
             }
             shard.forget(Duration::from_millis(self.config.tombstone_ttl_ms), now);
         }
@@ -227,32 +246,55 @@ impl Sessions {
         metrics::gauge!("ada_session_state_bytes").set(self.bytes() as f64);
     }
 
-    /// Evicts the session that is idle for longest. Whether it finds one or not, it looks at a few sessions only.
+    /// Evicts a session that nobody has asked for, else the one that is idle for longest. Whether it finds one or not, it looks at a few
+    /// sessions only.
     fn evict(&self, now: Instant) -> Result<(), ServiceError> {
+        if self.evict_unused(now) {
+            return Ok(());
+        }
         let idle_min = Duration::from_millis(self.config.evict_idle_ms);
         for _ in 0..LOOKS_MAX {
-            let Some((filed, id)) = self.idle.lock().first(idle_min, now) else { break };
-            let mut shard = self.shard(id).lock();
-            let Some(session) = shard.live.get(&id).cloned() else {
-                self.idle.lock().forget(id);
+            let Some((filed, handle)) = self.idle.lock().first(idle_min, now) else { break };
+            let mut shard = self.shard(handle).lock();
+            let Some(session) = shard.live.get(&handle).cloned() else {
+                self.idle.lock().forget(handle);
                 continue;
             };
             let since = session.idle_since().unwrap_or(now);
             if since == filed && session.end_if_idle(idle_min, now) {
-                self.bury(&mut shard, id, Ending::Evicted, now);
+                self.bury(&mut shard, handle, Ending::Evicted, now);
                 return Ok(());
             }
             // Touched since: another one may have been idle for longer.
-            self.idle.lock().file(id, since);
+            self.idle.lock().file(handle, since);
         }
         metrics::counter!("ada_shed_total", "reason" => "QUOTA").increment(1);
         Err(ServiceError::Quota { retry_after_ms: self.config.reap_interval_ms })
     }
 
+    /// Evicts the oldest of those that nobody has asked for; says whether there was one. Whoever opens without end takes places from its own
+    /// like.
+    fn evict_unused(&self, now: Instant) -> bool {
+        let idle_min = Duration::from_millis(self.config.unused_idle_ms.min(self.config.evict_idle_ms));
+        for _ in 0..LOOKS_MAX {
+            let Some((_, handle)) = self.unused.lock().first(idle_min, now) else { break };
+            let mut shard = self.shard(handle).lock();
+            let session = shard.live.get(&handle).cloned();
+            if session.is_some_and(|session| session.is_unused() && session.end_if_idle(idle_min, now)) {
+                self.bury(&mut shard, handle, Ending::Evicted, now);
+                return true;
+            }
+            // It has ended, or was asked for, a moment ago.
+            self.unused.lock().forget(handle);
+        }
+        false
+    }
+
     /// What is known of a session beside its shard.
     fn forget(&self, session: &Session) {
         self.len.fetch_sub(1, Ordering::Relaxed);
-        self.idle.lock().forget(session.id);
+        self.idle.lock().forget(session.handle);
+        self.unused.lock().forget(session.handle);
         if !session.request_id.is_empty() {
             let mut opened = self.opened.lock();
             if opened.get(&session.request_id) == Some(&session.id) {
@@ -261,19 +303,19 @@ impl Sessions {
         }
     }
 
-    fn bury(&self, shard: &mut Shard, id: Uuid, ending: Ending, now: Instant) {
-        let Some(session) = shard.live.remove(&id) else { return };
+    fn bury(&self, shard: &mut Shard, handle: Handle, ending: Ending, now: Instant) {
+        let Some(session) = shard.live.remove(&handle) else { return };
         self.forget(&session);
         metrics::counter!("ada_sessions_ended_total", "reason" => ending.word()).increment(1);
-        shard.ended.insert(id, ending);
-        shard.endings.push_back((now, id));
+        shard.ended.insert(handle, ending);
+        shard.endings.push_back((now, handle));
         if shard.endings.len() > self.config.tombstones_max.div_ceil(SHARDS) {
             shard.forget_oldest();
         }
     }
 
-    fn shard(&self, id: Uuid) -> &Mutex<Shard> {
-        &self.shards[usize::from(id.as_bytes()[0]) % SHARDS]
+    fn shard(&self, handle: Handle) -> &Mutex<Shard> {
+        &self.shards[usize::from(handle.first_byte()) % SHARDS]
     }
 }
 
@@ -290,8 +332,8 @@ impl Shard {
     }
 
     fn forget_oldest(&mut self) {
-        if let Some((_, id)) = self.endings.pop_front() {
-            self.ended.remove(&id);
+        if let Some((_, handle)) = self.endings.pop_front() {
+            self.ended.remove(&handle);
         }
     }
 }
@@ -324,7 +366,26 @@ mod tests {
         let ended = ids.map(|id| sessions.get(id, begin + 4 * MINUTE).err());
         assert_eq!(ended, [None, Some(ServiceError::SessionEvicted), None]);
         sessions.close(ids[2], begin + 4 * MINUTE).unwrap();
-        assert_eq!((sessions.len(), sessions.idle.lock().order.len()), (2, 2), "who has left is forgotten");
+        let filed = sessions.idle.lock().order.len() + sessions.unused.lock().order.len();
+        assert_eq!((sessions.len(), filed), (2, 2), "who has left is forgotten");
+    }
+
+    /// Whoever opens without end takes the places of its own like, and not those of sessions that somebody uses.
+    #[test]
+    fn who_is_not_asked_for_goes_first() {
+        let (sessions, opening) = table(4);
+        let begin = Instant::now();
+        let used = [0, 1].map(|_| sessions.open(opening(), begin).unwrap().id);
+        used.iter().for_each(|id| drop(sessions.get(*id, begin).unwrap()));
+        let soon = begin + 2 * MINUTE;
+        for i in 0..100 {
+            let now = soon + i * Duration::from_millis(600);
+            sessions.open(opening(), now).unwrap();
+        }
+        let now = soon + MINUTE;
+        assert!(used.iter().all(|id| sessions.get(*id, now).is_ok()));
+        sessions.open(opening(), now).unwrap();
+        assert_eq!(sessions.open(opening(), now).err(), Some(ServiceError::Quota { retry_after_ms: 1_000 }), "none is old enough");
     }
 
     /// A refusal scanned all sessions, up to four times: 433 a second made good acts wait 226 ms. It looks at a few, and finds the idle one
@@ -334,8 +395,9 @@ mod tests {
         let (sessions, opening) = table(201);
         let begin = Instant::now();
         let ids: Vec<Uuid> = (0..201).map(|_| sessions.open(opening(), begin).unwrap().id).collect();
+        ids.iter().for_each(|id| drop(sessions.get(*id, begin).unwrap()));
         let mut order: Vec<Uuid> = ids.clone();
-        order.sort();
+        order.sort_by_key(|id| Handle::of(*id));
         // The last that will be looked at is the only idle one.
         let (idle, hot) = order.split_last().unwrap();
         for id in hot {

@@ -36,13 +36,14 @@ pub enum Kind {
 use Kind::{Counter, Gauge, Histogram};
 
 /// Every metric: name, kind, meaning.
-pub const CATALOGUE: [(&str, Kind, &str); 34] = [
+pub const CATALOGUE: [(&str, Kind, &str); 35] = [
     ("ada_build_info", Gauge, "1, labelled by version"),
     ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
     ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
     ("ada_model_load_duration_seconds", Histogram, "time to read, check and build a model"),
     ("ada_connections", Gauge, "open connections"),
     ("ada_connections_refused_total", Counter, "connections beyond server.connections_max"),
+    ("ada_held_bytes", Gauge, "bytes of requests on their way in and of answers that are not taken"),
     ("ada_connections_timed_out_total", Counter, "connections closed because they did not speak in time"),
     ("ada_http_requests_total", Counter, "requests of either face, by face, route and status"),
     ("ada_http_request_duration_seconds", Histogram, "until the response head of a request, by face"),
@@ -67,7 +68,11 @@ pub const CATALOGUE: [(&str, Kind, &str); 34] = [
     ("ada_sessions", Gauge, "live sessions"),
     ("ada_session_state_bytes", Gauge, "memory of all episodes"),
     ("ada_sessions_created_total", Counter, "sessions opened"),
-    ("ada_sessions_ended_total", Counter, "sessions ended, by reason: closed, expired, evicted"),
+    (
+        "ada_sessions_ended_total",
+        Counter,
+        "sessions ended, by reason: closed, expired, evicted, undone (nobody took the answer of the open)",
+    ),
     ("ada_engine_panics_total", Counter, "panics caught in the engine"),
     ("ada_log_lines_left_out_total", Counter, "log lines that could not be written, or repeated a message too often, by reason"),
     ("ada_nonfinite_total", Counter, "non-finite network outputs, by place"),

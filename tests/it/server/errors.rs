@@ -408,7 +408,8 @@ async fn a_timeout_of_a_call_is_no_deadline() {
     service.set_registry(service.warm_up(registry).unwrap());
     let (router, _) = grpc::router(service).unwrap();
     let mut agent = AgentClient::new(router);
-    let open = pb::OpenSessionRequest { model: "slow".into(), ..Default::default() };
+    // Named, so that it is not undone where no listener takes the answer.
+    let open = pb::OpenSessionRequest { model: "slow".into(), request_id: "one".into(), ..Default::default() };
     let id = agent.open_session(open).await.unwrap().into_inner().session.unwrap().session_id;
     let mut ask = async |deadline_ms, grpc_timeout: &str| {
         let mut request = tonic::Request::new(pb::ActRequest { deadline_ms, ..act(&id, 1, &STATE) });

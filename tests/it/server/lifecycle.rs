@@ -75,6 +75,33 @@ async fn a_drain_ends_in_bounded_time_whatever_the_clients_do() {
     assert!(blocked.await.unwrap().is_err());
 }
 
+/// Somebody who watched the server's health, or had asked reflection and kept the stream, made each drain last for all of
+/// `server.drain_timeout_ms`.
+#[tokio::test(flavor = "multi_thread")]
+async fn who_watches_does_not_hold_a_drain() {
+    use futures_util::{StreamExt, stream};
+    use tonic_reflection::pb::v1::{
+        ServerReflectionRequest, server_reflection_client::ServerReflectionClient, server_reflection_request::MessageRequest,
+    };
+    let mut server = start(|_| {}).await;
+    let watch = HealthClient::new(server.channel().await).watch(HealthCheckRequest { service: String::new() }).await;
+    let mut watch = watch.unwrap().into_inner();
+    assert_eq!(watch.message().await.unwrap().unwrap().status, 1, "SERVING");
+    let list = ServerReflectionRequest { host: String::new(), message_request: Some(MessageRequest::ListServices(String::new())) };
+    let questions = stream::iter([list]).chain(stream::pending());
+    let mut reflection = ServerReflectionClient::new(server.channel().await).server_reflection_info(questions).await.unwrap().into_inner();
+    assert!(reflection.message().await.unwrap().is_some());
+    let acts = server.agent().await.act_stream(stream::pending::<pb::ActRequest>()).await.unwrap();
+    let begin = Instant::now();
+    server.stop.cancel();
+    assert_eq!(watch.message().await.unwrap().unwrap().status, 2, "NOT_SERVING, and then the end");
+    assert_eq!(watch.message().await.unwrap_err().code(), Code::Unavailable);
+    assert_eq!(reflection.message().await.unwrap_err().code(), Code::Unavailable);
+    timeout(Duration::from_secs(5), &mut server.done).await.expect("it did not end").unwrap().unwrap();
+    assert!(begin.elapsed() < Duration::from_secs(2), "{:?}", begin.elapsed());
+    drop(acts);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn an_act_in_flight_survives_a_drain() {
     let mut server = start(|config| config.engine.deadline_margin_ms = 200).await;

@@ -266,19 +266,32 @@ async fn answers_that_are_not_taken_cut_the_connection() {
     assert!(server.metric("ada_connections_timed_out_total").await >= 1.0);
 }
 
-/// A unary gRPC request whose body stops on the way waited for ever.
+/// A gRPC request whose body stops on the way waited for ever, and one that comes byte by byte did so after that was mended. A message of a
+/// stream that has begun must come too; between messages a stream may be silent.
 #[tokio::test(flavor = "multi_thread")]
 async fn unfinished_grpc_requests_end() {
+    use futures_util::{StreamExt, stream};
     let server = start(|config| config.connection.body_read_timeout_ms = 300).await;
-    let (mut sender, _connection) = http2(server.address).await;
-    let begun = Body::from_stream(futures_util::StreamExt::chain(
-        futures_util::stream::iter([Ok::<_, std::io::Error>(vec![0_u8, 0, 0, 0, 9, 1])]),
-        futures_util::stream::pending(),
-    ));
-    let request = hyper::Request::post(format!("http://{}/ada_diffuser.v1.Agent/Act", server.address));
-    let request = request.header("content-type", "application/grpc").header("te", "trailers").body(begun).unwrap();
-    let response = timeout(Duration::from_secs(5), sender.send_request(request)).await.expect("it waits for ever").unwrap();
-    assert_ne!(response.headers().get("grpc-status").map(hyper::header::HeaderValue::as_bytes), Some(b"0".as_slice()));
+    let (sender, _connection) = http2(server.address).await;
+    let call = async |method: &str, body: Body| {
+        let request = hyper::Request::post(format!("http://{}/ada_diffuser.v1.Agent/{method}", server.address));
+        let request = request.header("content-type", "application/grpc").header("te", "trailers").body(body).unwrap();
+        let response = timeout(Duration::from_secs(5), sender.clone().send_request(request)).await.expect("it waits for ever").unwrap();
+        let (parts, body) = response.into_parts();
+        let body = Body::new(body);
+        (parts.headers, timeout(Duration::from_secs(5), to_bytes(body, usize::MAX)).await.expect("it waits for ever").unwrap())
+    };
+    let begun = || stream::iter([Ok::<_, std::io::Error>(vec![0_u8, 0, 0, 0, 99])]);
+    let trickle = stream::unfold((), async |()| {
+        tokio::time::sleep(Duration::from_millis(50)).await;
+        Some((Ok(vec![1]), ()))
+    });
+    for body in [Body::from_stream(begun().chain(stream::pending())), Body::from_stream(begun().chain(Box::pin(trickle)))] {
+        let (headers, _) = call("Act", body).await;
+        assert_eq!((&headers["grpc-status"], &headers["ada-reason"]), (&"4".parse().unwrap(), &"DEADLINE_ADMISSION".parse().unwrap()));
+    }
+    let (_, results) = call("ActStream", Body::from_stream(begun().chain(stream::pending()))).await;
+    assert!(String::from_utf8_lossy(&results).contains("DEADLINE_ADMISSION"), "{results:?}");
 }
 
 /// One address has its share of the places, and another finds one all the same.

@@ -1,10 +1,13 @@
 //! A real server on a free port, and a client for each face.
 
 mod bytes;
+mod counters;
 mod ends;
 mod engine;
 mod errors;
+mod frames;
 mod generator;
+mod hold;
 mod late;
 mod lifecycle;
 mod limits;

@@ -238,28 +238,80 @@ async fn a_reset_begins_again() {
 #[tokio::test(flavor = "multi_thread")]
 async fn sessions_are_listed_and_closed() {
     let server = start(|_| {}).await;
-    let mut ids = HashSet::new();
+    let (mut ids, mut handles) = (HashSet::new(), HashSet::new());
     for _ in 0..7 {
-        ids.insert(server.open(json!({})).await);
+        let id = server.open(json!({})).await;
+        let session = server.get(&format!("/v1/sessions/{id}")).await.json()["session"].clone();
+        handles.insert(session["handle"].as_str().unwrap().to_owned());
+        ids.insert(id);
     }
+    assert!(handles.len() == 7 && handles.is_disjoint(&ids));
     let other = server.open(json!({"model": "slow"})).await;
     let (mut seen, mut token, mut pages) = (HashSet::new(), String::new(), 0);
     loop {
         let page = server.get(&format!("/v1/sessions?page_size=3&model=tiny&page_token={token}")).await.json();
-        seen.extend(page["sessions"].as_array().unwrap().iter().map(|session| session["session_id"].as_str().unwrap().to_owned()));
+        assert!(ids.iter().all(|id| !page.to_string().contains(id)), "a list tells an id: {page}");
+        seen.extend(page["sessions"].as_array().unwrap().iter().map(|session| session["handle"].as_str().unwrap().to_owned()));
         token = page["next_page_token"].as_str().unwrap().to_owned();
         pages += 1;
         if token.is_empty() {
             break;
         }
     }
-    assert_eq!((seen, pages), (ids.clone(), 3));
+    assert_eq!((seen, pages), (handles.clone(), 3));
     let all = server.agent().await.list_sessions(pb::ListSessionsRequest::default()).await.unwrap().into_inner();
     assert_eq!((all.sessions.len(), all.next_page_token.as_str()), (8, ""));
+    assert!(all.sessions.iter().all(|session| session.session_id.is_empty() && !session.handle.is_empty()));
     let mut agent = server.agent().await;
     agent.close_session(pb::CloseSessionRequest { session_id: other.clone() }).await.unwrap();
     let gone = agent.get_session(pb::GetSessionRequest { session_id: other }).await.unwrap_err();
     assert_eq!(failure(&gone), (Code::NotFound, "SESSION_NOT_FOUND".into()));
+}
+
+/// Knowing a session's id is the right to use it, and every list told all ids.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_handle_is_no_right_to_anything() {
+    let server = start(|_| {}).await;
+    let id = server.open(json!({})).await;
+    let listed = server.get("/v1/sessions?view=full").await.json()["sessions"][0].clone();
+    let handle = listed["handle"].as_str().unwrap();
+    let grpc = server.agent().await.act(act(handle, 1, &STATE)).await.unwrap_err();
+    assert_eq!(failure(&grpc), (Code::NotFound, "SESSION_NOT_FOUND".into()));
+    for (method, verb) in [("GET", ""), ("DELETE", ""), ("POST", "/reset"), ("POST", "/act")] {
+        let body = if verb == "/act" { json!({"step": 1, "observation": {"state": STATE}}).to_string() } else { String::new() };
+        let reply = server.http(method, &format!("/v1/sessions/{handle}{verb}"), &body).await;
+        assert_eq!((reply.status, reply.reason().as_str()), (404, "SESSION_NOT_FOUND"), "{method} {verb}");
+    }
+    assert_eq!(server.act(&id, 1, &STATE).await.json()["step"], 1);
+}
+
+/// A list is short unless asked, over both faces.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_list_is_short_unless_asked() {
+    let server = start(|_| {}).await;
+    let id = server.open(json!({})).await;
+    assert_eq!(server.act(&id, 1, &STATE).await.status, 200);
+    let mut own = server.get(&format!("/v1/sessions/{id}")).await.json()["session"].clone();
+    let long = ["model_digest", "seed", "options", "latent_mean", "latent_log_var"];
+    let rest = async |query: &str| server.get(&format!("/v1/sessions{query}")).await.json()["sessions"][0].clone();
+    for short in [rest("").await, rest("?view=basic").await] {
+        assert!(long.iter().all(|field| short.get(field).is_none()), "{short}");
+        assert_eq!((&short["committed_step"], &short["model"], &short["handle"]), (&json!(1), &json!("tiny"), &own["handle"]));
+    }
+    let mut full = rest("?view=full").await;
+    for session in [&mut own, &mut full] {
+        let fields = session.as_object_mut().unwrap();
+        ["session_id", "age_ms", "idle_ms"].iter().for_each(|field| drop(fields.remove(*field)));
+    }
+    assert_eq!(full, own);
+    assert_eq!(server.get("/v1/sessions?view=long").await.reason(), "REQUEST_INVALID");
+    let mut agent = server.agent().await;
+    let mut grpc = async |view: i32| agent.list_sessions(pb::ListSessionsRequest { view, ..Default::default() }).await;
+    let short = grpc(0).await.unwrap().into_inner().sessions.remove(0);
+    assert!(short.options.is_none() && short.latent_mean.is_empty() && short.model_digest.is_empty() && short.seed == 0);
+    let full = grpc(2).await.unwrap().into_inner().sessions.remove(0);
+    assert!(full.options.is_some() && full.latent_mean.len() == 6 && full.session_id.is_empty() && full.handle == short.handle);
+    assert_eq!(grpc(3).await.unwrap_err().code(), Code::InvalidArgument);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -68,7 +68,8 @@ class GrpcFace:
         return _summary(self._call(self._agent.GetSession, request, timeout_s).session)
 
     def list_sessions(self, model: str, page_size: int, page_token: str, timeout_s: float) -> tuple[list[SessionSummary], str]:
-        request = agent_pb2.ListSessionsRequest(model=model, page_size=page_size, page_token=page_token)
+        view = agent_pb2.SESSION_VIEW_FULL
+        request = agent_pb2.ListSessionsRequest(model=model, page_size=page_size, page_token=page_token, view=view)
         answer = self._call(self._agent.ListSessions, request, timeout_s)
         return [_summary(session) for session in answer.sessions], answer.next_page_token
 
@@ -224,6 +225,7 @@ def _trained(trained: models_pb2.Trained) -> Trained:
 def _summary(session: agent_pb2.Session) -> SessionSummary:
     return SessionSummary(
         session_id=session.session_id,
+        handle=session.handle,
         model=session.model,
         model_digest=session.model_digest,
         seed=session.seed,

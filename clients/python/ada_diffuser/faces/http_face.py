@@ -65,9 +65,9 @@ class HttpFace:
         return _read(_summary, self._call("GET", f"/v1/sessions/{_quoted(session_id)}", None, timeout_s), "session")
 
     def list_sessions(self, model: str, page_size: int, page_token: str, timeout_s: float) -> tuple[list[SessionSummary], str]:
-        query = urlencode(_without_none(model=model or None, page_size=page_size or None, page_token=page_token or None))
-        answer = self._call("GET", "/v1/sessions" + (f"?{query}" if query else ""), None, timeout_s)
-        return _read(lambda sessions: [_summary(session) for session in sessions], answer, "sessions"), _read(
+        wanted = _without_none(model=model or None, page_size=page_size or None, page_token=page_token or None)
+        answer = self._call("GET", "/v1/sessions?" + urlencode({"view": "full", **wanted}), None, timeout_s)
+        return _read(lambda sessions: [_summary({"session_id": "", **session}) for session in sessions], answer, "sessions"), _read(
             str, answer, "next_page_token"
         )
 

@@ -14,10 +14,19 @@ class Start(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     START_COLD: _ClassVar[Start]
     START_WARM: _ClassVar[Start]
     START_RENOISED: _ClassVar[Start]
+
+class SessionView(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SESSION_VIEW_UNSPECIFIED: _ClassVar[SessionView]
+    SESSION_VIEW_BASIC: _ClassVar[SessionView]
+    SESSION_VIEW_FULL: _ClassVar[SessionView]
 START_UNSPECIFIED: Start
 START_COLD: Start
 START_WARM: Start
 START_RENOISED: Start
+SESSION_VIEW_UNSPECIFIED: SessionView
+SESSION_VIEW_BASIC: SessionView
+SESSION_VIEW_FULL: SessionView
 
 class OpenSessionRequest(_message.Message):
     __slots__ = ("model", "seed", "options", "ttl_ms", "request_id")
@@ -216,14 +225,16 @@ class GetSessionResponse(_message.Message):
     def __init__(self, session: _Optional[_Union[Session, _Mapping]] = ...) -> None: ...
 
 class ListSessionsRequest(_message.Message):
-    __slots__ = ("page_size", "page_token", "model")
+    __slots__ = ("page_size", "page_token", "model", "view")
     PAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
     PAGE_TOKEN_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
+    VIEW_FIELD_NUMBER: _ClassVar[int]
     page_size: int
     page_token: str
     model: str
-    def __init__(self, page_size: _Optional[int] = ..., page_token: _Optional[str] = ..., model: _Optional[str] = ...) -> None: ...
+    view: SessionView
+    def __init__(self, page_size: _Optional[int] = ..., page_token: _Optional[str] = ..., model: _Optional[str] = ..., view: _Optional[_Union[SessionView, str]] = ...) -> None: ...
 
 class ListSessionsResponse(_message.Message):
     __slots__ = ("sessions", "next_page_token")
@@ -244,7 +255,7 @@ class CloseSessionResponse(_message.Message):
     def __init__(self) -> None: ...
 
 class Session(_message.Message):
-    __slots__ = ("session_id", "model", "model_digest", "seed", "committed_step", "episode", "options", "latent_mean", "latent_log_var", "age_ms", "idle_ms", "ttl_ms", "state_bytes", "busy")
+    __slots__ = ("session_id", "model", "model_digest", "seed", "committed_step", "episode", "options", "latent_mean", "latent_log_var", "age_ms", "idle_ms", "ttl_ms", "state_bytes", "busy", "handle")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     MODEL_DIGEST_FIELD_NUMBER: _ClassVar[int]
@@ -259,6 +270,7 @@ class Session(_message.Message):
     TTL_MS_FIELD_NUMBER: _ClassVar[int]
     STATE_BYTES_FIELD_NUMBER: _ClassVar[int]
     BUSY_FIELD_NUMBER: _ClassVar[int]
+    HANDLE_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     model: str
     model_digest: str
@@ -273,4 +285,5 @@ class Session(_message.Message):
     ttl_ms: int
     state_bytes: int
     busy: bool
-    def __init__(self, session_id: _Optional[str] = ..., model: _Optional[str] = ..., model_digest: _Optional[str] = ..., seed: _Optional[int] = ..., committed_step: _Optional[int] = ..., episode: _Optional[int] = ..., options: _Optional[_Union[_models_pb2.SamplerOptions, _Mapping]] = ..., latent_mean: _Optional[_Iterable[float]] = ..., latent_log_var: _Optional[_Iterable[float]] = ..., age_ms: _Optional[int] = ..., idle_ms: _Optional[int] = ..., ttl_ms: _Optional[int] = ..., state_bytes: _Optional[int] = ..., busy: bool = ...) -> None: ...
+    handle: str
+    def __init__(self, session_id: _Optional[str] = ..., model: _Optional[str] = ..., model_digest: _Optional[str] = ..., seed: _Optional[int] = ..., committed_step: _Optional[int] = ..., episode: _Optional[int] = ..., options: _Optional[_Union[_models_pb2.SamplerOptions, _Mapping]] = ..., latent_mean: _Optional[_Iterable[float]] = ..., latent_log_var: _Optional[_Iterable[float]] = ..., age_ms: _Optional[int] = ..., idle_ms: _Optional[int] = ..., ttl_ms: _Optional[int] = ..., state_bytes: _Optional[int] = ..., busy: bool = ..., handle: _Optional[str] = ...) -> None: ...

@@ -30,7 +30,8 @@ class AgentStub(object):
 
     The step protocol. A session counts its acts. The client sends `step = committed_step + 1`; the answer commits it. Sending the committed step again
     with the same observation gives the same bytes again with `replayed = true` and spends no network evaluation, so a client may retry whenever it is in
-    doubt; while the first one still runs, the second waits for its answer. An act that fails, is cancelled or runs out of time changes nothing.
+    doubt; while the first one still runs, the second waits for its answer. An act that fails changes nothing; one that is cancelled or runs out of time may be
+    committed at that very moment, and then the same step again gives its answer.
     A network may deliver a copy late. A client that says to which `episode` an act or a reset belongs is refused (EPISODE_OVER) what comes after the
     next reset, and one that gives each open and reset a `request_id` of its own may send them again without opening or resetting twice.
 
@@ -92,7 +93,8 @@ class AgentServicer(object):
 
     The step protocol. A session counts its acts. The client sends `step = committed_step + 1`; the answer commits it. Sending the committed step again
     with the same observation gives the same bytes again with `replayed = true` and spends no network evaluation, so a client may retry whenever it is in
-    doubt; while the first one still runs, the second waits for its answer. An act that fails, is cancelled or runs out of time changes nothing.
+    doubt; while the first one still runs, the second waits for its answer. An act that fails changes nothing; one that is cancelled or runs out of time may be
+    committed at that very moment, and then the same step again gives its answer.
     A network may deliver a copy late. A client that says to which `episode` an act or a reset belongs is refused (EPISODE_OVER) what comes after the
     next reset, and one that gives each open and reset a `request_id` of its own may send them again without opening or resetting twice.
 
@@ -145,7 +147,7 @@ class AgentServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ListSessions(self, request, context):
-        """The summaries of all sessions, by id.
+        """What there is: all sessions, by handle. A list tells no `session_id`, for knowing it is the right to use the session.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -214,7 +216,8 @@ class Agent(object):
 
     The step protocol. A session counts its acts. The client sends `step = committed_step + 1`; the answer commits it. Sending the committed step again
     with the same observation gives the same bytes again with `replayed = true` and spends no network evaluation, so a client may retry whenever it is in
-    doubt; while the first one still runs, the second waits for its answer. An act that fails, is cancelled or runs out of time changes nothing.
+    doubt; while the first one still runs, the second waits for its answer. An act that fails changes nothing; one that is cancelled or runs out of time may be
+    committed at that very moment, and then the same step again gives its answer.
     A network may deliver a copy late. A client that says to which `episode` an act or a reset belongs is refused (EPISODE_OVER) what comes after the
     next reset, and one that gives each open and reset a `request_id` of its own may send them again without opening or resetting twice.
 
