@@ -9,7 +9,7 @@ use crate::{
     serve::{
         registry::Model,
         request::{ActResult, Acted},
-        session::{Answer, Detail, Summary, Timings},
+        session::{Answer, Summary, Timings},
     },
 };
 use serde::Serialize;
@@ -134,8 +134,18 @@ pub struct SessionAnswer {
     committed_step: u64,
     /// How often it was reset.
     episode: u64,
-    #[serde(flatten)]
-    detail: Option<DetailAnswer>,
+    /// Absent in short lists, as are the next four.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    model_digest: Option<String>,
+    /// Seed of the running episode.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    seed: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    options: Option<OptionsBody>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    latent_mean: Option<Vec<f32>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    latent_log_var: Option<Vec<f32>>,
     age_ms: u64,
     idle_ms: u64,
     ttl_ms: u64,
@@ -144,36 +154,27 @@ pub struct SessionAnswer {
     busy: bool,
 }
 
-/// What a short list leaves out.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct DetailAnswer {
-    model_digest: String,
-    /// Seed of the running episode.
-    seed: u64,
-    options: OptionsBody,
-    latent_mean: Vec<f32>,
-    latent_log_var: Vec<f32>,
-}
-
-impl From<Detail> for DetailAnswer {
-    fn from(detail: Detail) -> Self {
-        let Detail { model_digest, seed, options, latent } = detail;
-        let (latent_mean, latent_log_var) = latent.unwrap_or_default();
-        Self { model_digest, seed, options: (&options).into(), latent_mean, latent_log_var }
-    }
-}
-
 impl From<Summary> for SessionAnswer {
     fn from(summary: Summary) -> Self {
         let Summary { id, handle, model, committed_step, episode, detail, age, idle, ttl, state_bytes, busy } = summary;
         let ms = |time: Duration| time.as_millis() as u64;
+        let (mut digest, mut seed, mut options, mut latents) = (None, None, None, None);
+        if let Some(detail) = detail {
+            (digest, seed, options) = (Some(detail.model_digest), Some(detail.seed), Some((&detail.options).into()));
+            latents = Some(detail.latent.unwrap_or_default());
+        }
+        let (latent_mean, latent_log_var) = latents.unzip();
         Self {
             session_id: id.map(|id| id.to_string()),
             handle: handle.to_string(),
             model: model.to_string(),
             committed_step,
             episode,
-            detail: detail.map(Into::into),
+            model_digest: digest,
+            seed,
+            options,
+            latent_mean,
+            latent_log_var,
             age_ms: ms(age),
             idle_ms: ms(idle),
             ttl_ms: ms(ttl),

@@ -349,6 +349,8 @@ def _model(model: Mapping[str, Any]) -> Model:
 
 def _summary(session: Mapping[str, Any]) -> SessionSummary:
     special = ("options", "latent_mean", "latent_log_var")
+    # Servers before 0.1 have no handles.
+    session = {"handle": "", **session}
     plain = {name: session[name] for name in SessionSummary.__dataclass_fields__ if name not in special}
     return SessionSummary(
         **plain,
