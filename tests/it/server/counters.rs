@@ -77,7 +77,7 @@ async fn mixed(mut agent: AgentClient<Channel>, address: SocketAddr, id: String,
             Err(status) => trailer(&status, "ada-committed-step").map_or(step, |committed| committed.parse::<u64>().unwrap() + 1),
         };
     }
-    if client % 4 == 0 {
+    if client.is_multiple_of(4) {
         server.http("DELETE", &format!("/v1/sessions/{id}"), "").await;
     }
     (told, sent)
