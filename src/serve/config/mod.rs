@@ -266,7 +266,7 @@ impl Default for EngineConfig {
             queue_len_max: 1024,
             queue_bytes_max: 64 << 20,
             turn_ms_max: 100,
-            wait_ms_max: 300,
+            wait_ms_max: 200,
             batch_len_max: 32,
             anytime: true,
             deadline_margin_ms: 1,

@@ -1,7 +1,7 @@
 //! The engine: threads of its own that run many acts at once, one network evaluation at a time.
 //!
 //! An act waits in the bounded `queue`, the earliest deadline first; a `worker` takes it into its batch; each `tick` is one evaluation shared by all
-//! acts of the batch, whatever rung each stands on. Acts join and leave between ticks, so nobody waits for another's ladder to end. An act whose
+//! acts of the batch, whatever rung each stands on. Acts join and leave between ticks, so nobody waits for another's ladder to end, and a client that fills the batch lets others go ahead (`turns`). An act whose
 //! client named a deadline takes larger jumps when the `cost` of ticks says that it would come too late; one that would come too late all the same,
 //! or wait for longer than acts may, is refused when it comes, and one that turns out to be late is dropped before it is computed. The engine knows
 //! neither sessions nor connections: it gives each outcome to a ticket.
@@ -9,6 +9,7 @@
 mod cost;
 mod queue;
 mod tick;
+mod turns;
 mod worker;
 
 use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode, Observation};

@@ -59,6 +59,18 @@ pub(super) struct Ask {
     pub useful: Duration,
 }
 
+/// How many jobs a worker takes.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Room {
+    /// Of any client.
+    pub any: usize,
+    /// Beyond those, of clients that hold little, where a heavy one has filled the batch.
+    pub light: usize,
+}
+
+/// Jobs that are looked at for a light client's.
+const LOOKS_MAX: usize = 64;
+
 /// Where a job waits: in order of turns, and among equal ones the first come first. A turn is a point in time, so whoever waits
 /// comes to be the first of all: nobody starves.
 pub(super) type Place = (Instant, u64);
@@ -226,8 +238,9 @@ impl<J> Queue<J> {
         self.inner.lock().remove(&place).map(|waiting| waiting.job)
     }
 
-    /// Jobs for a worker that holds `held` jobs now and has `room` for more; None: the end. Waits only if it holds none.
-    pub fn take(&self, worker: usize, held: usize, room: usize) -> Option<Vec<J>> {
+    /// Jobs for a worker that holds `held` jobs now and has `room` for more; None: the end. Waits only if it holds none. A client that
+    /// holds much of the batch (`is_heavy`) does not take the places that are kept for others.
+    pub fn take(&self, worker: usize, held: usize, room: Room, is_heavy: impl Fn(u64) -> bool) -> Option<Vec<J>> {
         let mut inner = self.inner.lock();
         inner.running[worker] = held;
         if inner.jobs.is_empty() && held == 0 && !inner.closed {
@@ -238,14 +251,19 @@ impl<J> Queue<J> {
         }
         // An even share: with two workers and four acts, two batches of two end sooner than one of four.
         let share = (inner.running.iter().sum::<usize>() + inner.jobs.len()).div_ceil(inner.running.len());
-        let count = share.saturating_sub(held).min(room).min(inner.jobs.len());
-        inner.running[worker] += count;
-        if inner.jobs.len() > count {
+        let count = share.saturating_sub(held).min(room.any).min(inner.jobs.len());
+        let mut taken: Vec<_> = std::iter::from_fn(|| inner.pop()).take(count).collect();
+        if count == room.any && room.light > 0 {
+            let light = inner.jobs.iter().take(LOOKS_MAX).filter(|(_, waiting)| !is_heavy(waiting.client));
+            let places: Vec<_> = light.map(|(place, _)| *place).take(room.light).collect();
+            taken.extend(places.iter().filter_map(|place| inner.remove(place)));
+        }
+        inner.running[worker] += taken.len();
+        if !inner.jobs.is_empty() {
             self.ready.notify_one();
         }
-        let taken: Vec<_> = std::iter::from_fn(|| inner.pop()).take(count).collect();
         let (work, more_wait) = (taken.iter().map(|waiting| waiting.work).sum(), !inner.jobs.is_empty());
-        inner.pace.note(count, work, more_wait, Instant::now());
+        inner.pace.note(taken.len(), work, more_wait, Instant::now());
         Some(taken.into_iter().map(|waiting| waiting.job).collect())
     }
 

@@ -14,6 +14,10 @@ fn ask(turn_by: Instant, bytes: usize) -> Ask {
 }
 
 impl Queue<i32> {
+    fn take_any(&self, worker: usize, held: usize, any: usize) -> Option<Vec<i32>> {
+        self.take(worker, held, Room { any, light: 0 }, |_| false)
+    }
+
     fn put(&self, job: i32, ask: Ask) -> Result<Place, Refusal> {
         match self.push(job, ask) {
             Ok((place, None)) => Ok(place),
@@ -35,13 +39,13 @@ fn bounded_and_left_at_once() {
     assert_eq!((queue.withdraw(first), queue.withdraw(first)), (Some(1), None));
     assert!(queue.put(3, ask(now, 1)).is_ok(), "who leaves makes room");
     assert_eq!(queue.put(4, ask(now, 1)), Err(Refusal::Full));
-    assert_eq!(queue.take(0, 0, 8), Some(vec![2, 3]));
+    assert_eq!(queue.take_any(0, 0, 8), Some(vec![2, 3]));
     assert_eq!(queue.load(), (0, 2));
-    assert_eq!(queue.take(0, 1, 8), Some(vec![]), "does not wait while it holds one");
+    assert_eq!(queue.take_any(0, 1, 8), Some(vec![]), "does not wait while it holds one");
     assert_eq!(queue.load(), (0, 1));
     assert_eq!(queue.close(), Vec::<i32>::new());
     assert_eq!(queue.put(5, ask(now, 1)), Err(Refusal::Closed));
-    assert_eq!(queue.take(0, 0, 8), None);
+    assert_eq!(queue.take_any(0, 0, 8), None);
 }
 
 /// An act may be told of thousands of steps: what waits is bounded in bytes too, but whatever fits into a message has its turn alone.
@@ -53,7 +57,7 @@ fn bounded_in_bytes() {
     queue.withdraw(large);
     assert!(queue.put(3, ask(now, 60)).is_ok() && queue.put(4, ask(now, 40)).is_ok());
     assert_eq!(queue.put(5, ask(now, 1)), Err(Refusal::Full));
-    assert_eq!(queue.take(0, 0, 1), Some(vec![3]));
+    assert_eq!(queue.take_any(0, 0, 1), Some(vec![3]));
     assert!(queue.put(6, ask(now, 60)).is_ok());
     assert_eq!(queue.close(), [4, 6]);
 }
@@ -64,14 +68,14 @@ fn workers_share() {
     for job in 0..5 {
         queue.put(job, ask(now, 1)).unwrap();
     }
-    assert_eq!(queue.take(0, 0, 8).unwrap().len(), 3);
-    assert_eq!(queue.take(1, 0, 8).unwrap().len(), 2);
+    assert_eq!(queue.take_any(0, 0, 8).unwrap().len(), 3);
+    assert_eq!(queue.take_any(1, 0, 8).unwrap().len(), 2);
     for job in 0..9 {
         queue.put(job, ask(now, 1)).unwrap();
     }
-    assert_eq!(queue.take(0, 2, 1).unwrap().len(), 1, "no more than there is room");
+    assert_eq!(queue.take_any(0, 2, 1).unwrap().len(), 1, "no more than there is room");
     assert_eq!(queue.load(), (8, 5));
-    queue.take(0, 0, 0);
+    queue.take_any(0, 0, 0);
     assert_eq!(queue.load(), (8, 2), "a worker that holds nothing any more, for whatever reason, runs nothing");
 }
 
@@ -84,14 +88,14 @@ fn earliest_deadline_first_and_nobody_starves() {
     for (job, after) in [(1, 30), (2, 10), (3, 20), (4, 10)] {
         queue.put(job, ask(at(after), 1)).unwrap();
     }
-    assert_eq!(queue.take(0, 0, 3), Some(vec![2, 4, 3]));
-    assert_eq!(queue.take(0, 0, 3), Some(vec![1]));
+    assert_eq!(queue.take_any(0, 0, 3), Some(vec![2, 4, 3]));
+    assert_eq!(queue.take_any(0, 0, 3), Some(vec![1]));
     queue.put(0, ask(at(100), 1)).unwrap();
     let mut turns = 0;
     for arrival in 1.. {
         queue.put(arrival, ask(at(arrival as u64 * 10 + 5), 1)).unwrap();
         turns += 1;
-        if queue.take(0, 0, 1).unwrap() == [0] {
+        if queue.take_any(0, 0, 1).unwrap() == [0] {
             break;
         }
     }
@@ -111,7 +115,7 @@ fn admitted_by_expected_wait() {
     assert_eq!(queue.put(10, Ask { wait_max: ms(70), useful: ms(60), ..late }), Err(Refusal::Late));
     assert!(queue.put(10, Ask { wait_max: ms(100), ..late }).is_ok());
     assert!(queue.put(11, Ask { turn_by: now + ms(40), client: 98, wait_max: ms(0), ..late }).is_ok(), "the first of all waits for nobody");
-    assert_eq!(queue.take(0, 0, 1), Some(vec![11]));
+    assert_eq!(queue.take_any(0, 0, 1), Some(vec![11]));
     assert_eq!(queue.expected_wait(), (ms(110), 1.0));
 }
 
@@ -127,10 +131,25 @@ fn one_clients_crowd_is_its_own() {
     assert!(matches!(crowd(50), Err((Refusal::Full, 50))), "its own last one is no reason to leave");
     let other = queue.push(100, Ask { client: 2, work: ms(10), ..ask(now + ms(105), 1) });
     assert!(matches!(other, Ok((_, Some(49)))), "the last of the crowd");
-    let first: Vec<_> = (0..3).filter_map(|_| queue.take(0, 0, 1)).flatten().collect();
+    let first: Vec<_> = (0..3).filter_map(|_| queue.take_any(0, 0, 1)).flatten().collect();
     assert_eq!(first, [0, 100, 1]);
-    (0..48).for_each(|_| drop(queue.take(0, 0, 1)));
+    (0..48).for_each(|_| drop(queue.take_any(0, 0, 1)));
     assert!(queue.inner.lock().clients.is_empty(), "who has nothing here is forgotten");
+}
+
+/// Where a heavy client has filled the batch, others still find a place.
+#[test]
+fn places_are_kept_for_the_light() {
+    let (queue, now) = (queue(9, 1), Instant::now());
+    for (job, client) in [(0, 1), (1, 1), (2, 2), (3, 1), (4, 3), (5, 2)] {
+        queue.put(job, Ask { client, ..ask(now, 1) }).unwrap();
+    }
+    let room = |any, light| Room { any, light };
+    let heavy = |client| client == 1;
+    assert_eq!(queue.take(0, 8, room(0, 2), heavy), Some(vec![2, 4]));
+    assert_eq!(queue.take(0, 8, room(0, 0), heavy), Some(vec![]));
+    assert_eq!(queue.take(0, 0, room(1, 2), heavy), Some(vec![0, 5]));
+    assert_eq!(queue.take(0, 0, room(9, 2), heavy), Some(vec![1, 3]));
 }
 
 /// The pace is what it was seen to be while others waited, and what warm-up promised before.

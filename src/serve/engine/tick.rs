@@ -3,6 +3,7 @@
 use super::{
     EngineOptions, Failure, Finished, Job, Patience, Question, Ticket,
     cost::{Costs, Slowness, Tariff},
+    turns::{Part, Turns},
 };
 use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode};
 use std::{
@@ -16,6 +17,7 @@ pub(super) struct Batch<T> {
     options: EngineOptions,
     groups: Vec<Group<T>>,
     slowness: Slowness,
+    turns: Turns,
 }
 
 /// Acts of one model; `descents[i]` belongs to `riders[i]`.
@@ -36,6 +38,13 @@ struct Pace {
     margin: Duration,
 }
 
+/// In which order acts find room in a tick.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Order {
+    First,
+    Then,
+}
+
 /// What becomes of an act before the next tick.
 enum Hurry {
     /// It takes part.
@@ -49,13 +58,14 @@ enum Hurry {
 struct Rider<T> {
     question: Question,
     ticket: T,
+    client: u64,
     submitted: Instant,
     started: Instant,
 }
 
 impl<T: Ticket> Batch<T> {
     pub fn new(options: EngineOptions) -> Self {
-        Self { options, groups: Vec::new(), slowness: Slowness::default() }
+        Self { options, groups: Vec::new(), slowness: Slowness::default(), turns: Turns::new(options.batch_len_max) }
     }
 
     /// Acts in it.
@@ -71,7 +81,7 @@ impl<T: Ticket> Batch<T> {
 
     /// Takes an act into a batch that will have this length; it takes part from the next tick on. One that would come too late is not begun.
     pub fn admit(&mut self, job: Job<T>, len: usize, tariff: &Tariff) {
-        let Job { agent, question, descent, ticket, submitted, turn_by: _, client: _ } = job;
+        let Job { agent, question, descent, ticket, submitted, turn_by: _, client } = job;
         if !ticket.is_wanted() {
             return;
         }
@@ -85,17 +95,32 @@ impl<T: Ticket> Batch<T> {
         }
         ticket.start();
         group.descents.push(descent);
-        group.riders.push(Rider { question, ticket, submitted, started: Instant::now() });
+        group.riders.push(Rider { question, ticket, client, submitted, started: Instant::now() });
     }
 
-    /// One evaluation for every act; those that are done leave.
+    /// Clients that hold much of it, and places beyond it that are kept for the others.
+    pub fn turns(&mut self) -> &Turns {
+        self.turns.count(self.groups.iter().flat_map(|group| &group.riders).map(|rider| rider.client));
+        &self.turns
+    }
+
+    /// One evaluation for every act whose client has its turn; those that are done leave.
     pub fn tick(&mut self) {
         let expected: Duration = self.groups.iter().map(Group::expected).sum();
-        let margin = self.options.deadline_margin;
+        let (margin, len_max) = (self.options.deadline_margin, self.options.batch_len_max);
+        let full = |group: &Group<T>| group.costs.as_ref().map(|costs| costs.tick(len_max, 0));
+        let credit = self.groups.iter().filter_map(full).max().unwrap_or_default();
+        let (part, begin) = (self.turns().part(credit), Instant::now());
         for group in &mut self.groups {
             let others = expected.saturating_sub(group.expected());
-            group.tick(&mut self.slowness, Pace { others, margin });
+            let pace = Pace { others, margin };
+            group.tick(&mut self.slowness, pace, len_max, |client| match (self.turns.is_heavy(client), part) {
+                (false, _) => Some(Order::First),
+                (true, Part::All) => Some(Order::Then),
+                (true, Part::Light) => None,
+            });
         }
+        self.turns.took(part, begin.elapsed());
         self.groups.retain(|group| !group.riders.is_empty());
     }
 
@@ -130,18 +155,19 @@ impl<T: Ticket> Batch<T> {
 }
 
 impl<T: Ticket> Group<T> {
-    fn tick(&mut self, slowness: &mut Slowness, pace: Pace) {
+    fn tick(&mut self, slowness: &mut Slowness, pace: Pace, len_max: usize, order: impl Fn(u64) -> Option<Order>) {
         self.drop_unwanted();
         self.hurry(slowness, pace);
         self.harvest();
-        if self.riders.is_empty() {
+        let len = self.line_up(len_max, order);
+        if len == 0 {
             return;
         }
-        let (begin, expected) = (Instant::now(), self.expected());
-        if advance(&self.agent, &mut self.descents).is_err() {
+        let (begin, expected) = (Instant::now(), self.expected_of(len));
+        if advance(&self.agent, &mut self.descents[..len]).is_err() {
             // Whose fault it was is unknown, and the descents may be half advanced: each act starts again, alone.
-            self.descents.drain(..).for_each(|descent| count_waste(&descent));
-            for rider in self.riders.drain(..) {
+            self.descents.drain(..len).for_each(|descent| count_waste(&descent));
+            for rider in self.riders.drain(..len) {
                 rider.ride_alone(&self.agent, self.costs.as_deref(), pace);
             }
             return;
@@ -152,10 +178,30 @@ impl<T: Ticket> Group<T> {
         self.harvest();
     }
 
-    /// What the next tick would have taken at warm-up.
+    /// Brings those that take part to the front; how many they are.
+    fn line_up(&mut self, len_max: usize, order: impl Fn(u64) -> Option<Order>) -> usize {
+        let mut len = 0;
+        for turn in [Order::First, Order::Then] {
+            for i in len..self.riders.len() {
+                if len < len_max && order(self.riders[i].client) == Some(turn) {
+                    self.riders.swap(len, i);
+                    self.descents.swap(len, i);
+                    len += 1;
+                }
+            }
+        }
+        len
+    }
+
+    /// What a tick of everyone would have taken at warm-up.
     fn expected(&self) -> Duration {
-        let fresh = self.descents.iter().filter(|descent| descent.evaluations() == 0).count();
-        self.costs.as_ref().map_or(Duration::ZERO, |costs| costs.tick(self.riders.len(), fresh))
+        self.expected_of(self.riders.len())
+    }
+
+    /// The same of the first ones.
+    fn expected_of(&self, len: usize) -> Duration {
+        let fresh = self.descents[..len].iter().filter(|descent| descent.evaluations() == 0).count();
+        self.costs.as_ref().map_or(Duration::ZERO, |costs| costs.tick(len, fresh))
     }
 
     /// Tells acts in a hurry how many evaluations they have time for; one that has time for none gives out what it has.

@@ -1,6 +1,6 @@
 //! One inference thread: get ready for new models, take what arrived, tick, show a sign of life.
 
-use super::{Shared, Ticket, tick::Batch};
+use super::{Shared, Ticket, queue::Room, tick::Batch};
 use std::{
     io,
     panic::{AssertUnwindSafe, catch_unwind},
@@ -43,8 +43,11 @@ fn run<T: Ticket>(shared: &Shared<T>, index: usize, batch: &mut Batch<T>) {
             let _gone = done.send(batch.warm_up(&agent, &shared.tariff, go_on));
         }
         loop {
-            let held = batch.len();
-            let Some(arrivals) = shared.queue.take(index, held, shared.options.batch_len_max.saturating_sub(held)) else { return };
+            let (held, len_max) = (batch.len(), shared.options.batch_len_max);
+            let turns = batch.turns();
+            let reserve = (len_max + turns.reserve()).saturating_sub(held.max(len_max));
+            let room = Room { any: len_max.saturating_sub(held), light: reserve };
+            let Some(arrivals) = shared.queue.take(index, held, room, |client| turns.is_heavy(client)) else { return };
             let full = held + arrivals.len();
             for job in arrivals {
                 batch.admit(*job, full, &shared.tariff);
