@@ -9,7 +9,7 @@ ENV ?= cheetah-wind-s
 EPISODES ?= 300
 DEMO_EPISODES ?= 32
 
-.PHONY: help demo serve collect train test test-rust test-python lint load overload bench docs proto-python tools clean
+.PHONY: help demo serve collect train test test-rust test-python lint load reliability bench docs proto-python tools clean
 
 help: ## This list.
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 24
@@ -47,9 +47,9 @@ lint: venv ## Formatting, clippy, docs and ruff, all with warnings as errors.
 load: ## Puts load on the server of `make serve`: make load LOAD="--clients 32 --seconds 10"; LOAD=--help tells more.
 	cargo run $(CARGO_FLAGS) --quiet --example load -- $(LOAD)
 
-overload: test-binaries venv ## Twice the load that the engine bears: who is answered in time? OVERLOAD=--help tells more.
+reliability: build venv ## The figures of docs/reliability.md: make reliability RELIABILITY="hostile overload"; RELIABILITY=--help tells more.
 	cargo build $(CARGO_FLAGS) --examples
-	$(BIN)/python tests/reliability/overload.py $(OVERLOAD)
+	$(BIN)/python -m tests.reliability $(RELIABILITY)
 
 bench: ## Kernel, forward, act and training-step times of this machine.
 	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 MALLOC_MMAP_THRESHOLD_=1073741824 MALLOC_TRIM_THRESHOLD_=4294967296 cargo bench --locked

@@ -22,6 +22,8 @@ pub const FORMAT_VERSION: u32 = 1;
 const CONFIG: &str = "config.json";
 const WEIGHTS: &str = "model.safetensors";
 const MANIFEST: &str = "manifest.json";
+/// The files of a checkpoint.
+pub const FILES: [&str; 3] = [CONFIG, WEIGHTS, MANIFEST];
 /// Largest config, manifest and safetensors header, in bytes.
 const HEADER_BYTES_MAX: u64 = 1 << 20;
 /// Largest weight file, in bytes.
@@ -108,6 +110,14 @@ impl Manifest {
             return Err(invalid(path, format!("format version {}, this program reads {FORMAT_VERSION}", manifest.format_version)));
         }
         Ok(manifest)
+    }
+
+    /// Bytes of a weight file that holds its tensors and nothing else: a larger one is refused before it is read.
+    fn weight_bytes_max(&self) -> u64 {
+        const LENGTH_BYTES: u64 = 8;
+        let values = |tensor: &TensorDigest| tensor.shape.iter().fold(1, |values: u64, dim| values.saturating_mul(*dim as u64));
+        let bytes = self.tensors.values().map(values).fold(0, |sum: u64, values| sum.saturating_add(values.saturating_mul(4)));
+        bytes.saturating_add(LENGTH_BYTES + HEADER_BYTES_MAX).min(WEIGHT_BYTES_MAX)
     }
 
     /// Gives the bytes back if they are the file that it calls `name`.

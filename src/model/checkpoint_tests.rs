@@ -165,6 +165,17 @@ fn a_huge_header_is_refused_before_it_is_parsed() {
     assert!(refusal(dir.path()).contains("header of 88000000 bytes"));
 }
 
+/// A weight file of 88 MB in the place of one of some KB was read whole before it was refused.
+#[test]
+fn a_weight_file_that_is_too_large_is_refused_before_it_is_read() {
+    let dir = copy();
+    let file = fs::OpenOptions::new().write(true).open(dir.path().join(WEIGHTS)).unwrap();
+    file.set_len(88_000_000).unwrap();
+    let (manifest, _) = load_manifest(dir.path()).unwrap();
+    let told = refusal(dir.path());
+    assert!(told.contains(WEIGHTS) && told.contains(&format!("larger than {} bytes", manifest.weight_bytes_max())), "{told}");
+}
+
 #[test]
 fn other_versions_and_unknown_fields_are_refused() {
     let dir = copy();

@@ -125,12 +125,13 @@ fn names(models: &BTreeMap<Arc<str>, Model>) -> String {
     shown.join(", ")
 }
 
-/// Sub-directories that hold a `config.json`, with their names, in order.
+/// Sub-directories that hold a file of a checkpoint, with their names, in order: one whose other files are missing is refused by name.
 fn checkpoint_dirs(dir: &Path) -> io::Result<Vec<(Arc<str>, PathBuf)>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(dir)? {
         let path = entry?.path();
-        if !path.join("config.json").is_file() {
+        let is_there = |file: &&str| path.join(file).symlink_metadata().is_ok();
+        if !checkpoint::FILES.iter().any(is_there) {
             continue;
         }
         match path.file_name().and_then(|name| name.to_str()).filter(|name| checkpoint::is_name(name)) {
@@ -168,13 +169,26 @@ fn refuse(name: &str, reason: &'static str, error: &dyn std::fmt::Display) {
 mod tests {
     use super::*;
 
+    /// Without its config a checkpoint was passed over in silence; a directory of something else still is.
+    #[test]
+    fn what_is_left_of_a_checkpoint_is_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let names = [("a", "model.safetensors"), ("b", "manifest.json"), ("c", "recipe.toml"), ("d", "config.json")];
+        for (name, file) in names {
+            fs::create_dir(dir.path().join(name)).unwrap();
+            fs::write(dir.path().join(name).join(file), "").unwrap();
+        }
+        let found = checkpoint_dirs(dir.path()).unwrap();
+        assert_eq!(found.iter().map(|(name, _)| &**name).collect::<Vec<_>>(), ["a", "b", "d"]);
+    }
+
     /// HalfCheetah-v5 is trained under this name, and was refused under it.
     #[test]
     fn names_of_environments_are_served() {
         let dir = tempfile::tempdir().unwrap();
         let name = "HalfCheetah-v5-seed0";
         fs::create_dir(dir.path().join(name)).unwrap();
-        for file in ["config.json", "model.safetensors", "manifest.json"] {
+        for file in checkpoint::FILES {
             fs::copy(Path::new("models/tiny").join(file), dir.path().join(name).join(file)).unwrap();
         }
         let config = ModelsConfig { dir: dir.path().into(), default: name.into(), ..ModelsConfig::default() };

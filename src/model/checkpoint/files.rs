@@ -54,7 +54,7 @@ impl Files {
             // `NAME.next` may have become `NAME` in between. Only the reason why `NAME` was not it is told: `NAME.next` is hardly ever there.
             found(&path).or_else(|error| found(&next(dir, name)).or_else(|_| found(&path)).map_err(|_| error))
         };
-        Ok(Self { config: part(CONFIG, HEADER_BYTES_MAX)?, weights: part(WEIGHTS, WEIGHT_BYTES_MAX)?, manifest })
+        Ok(Self { config: part(CONFIG, HEADER_BYTES_MAX)?, weights: part(WEIGHTS, parsed.weight_bytes_max())?, manifest })
     }
 
     /// Makes these the checkpoint of `dir` once `verify` has accepted what is on disk; otherwise the directory is as it was.
@@ -138,14 +138,17 @@ fn rename(dir: &Path, name: &str) -> Result<(), CheckpointError> {
 
 /// A file of at most this size. Only a regular one is opened: a pipe would keep the reader for as long as nobody writes.
 pub(super) fn read(path: &Path, bytes_max: u64) -> Result<Vec<u8>, CheckpointError> {
-    if !fs::metadata(path).map_err(|error| io(path, &error))?.is_file() {
+    let metadata = fs::metadata(path).map_err(|error| io(path, &error))?;
+    if !metadata.is_file() {
         return Err(invalid(path, "is no regular file"));
     }
-    let file = File::open(path).map_err(|error| io(path, &error))?;
-    let mut bytes = Vec::new();
-    file.take(bytes_max + 1).read_to_end(&mut bytes).map_err(|error| io(path, &error))?;
-    if bytes.len() as u64 > bytes_max {
-        return Err(invalid(path, format!("larger than {bytes_max} bytes")));
+    let too_large = || invalid(path, format!("larger than {bytes_max} bytes"));
+    if metadata.len() > bytes_max {
+        return Err(too_large());
     }
-    Ok(bytes)
+    let file = File::open(path).map_err(|error| io(path, &error))?;
+    let mut bytes = Vec::with_capacity(metadata.len() as usize);
+    // It may grow meanwhile.
+    file.take(bytes_max + 1).read_to_end(&mut bytes).map_err(|error| io(path, &error))?;
+    if bytes.len() as u64 > bytes_max { Err(too_large()) } else { Ok(bytes) }
 }

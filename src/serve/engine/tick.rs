@@ -182,7 +182,8 @@ impl<T: Ticket> Group<T> {
     fn line_up(&mut self, len_max: usize, order: impl Fn(u64) -> Option<Order>) -> usize {
         let mut len = 0;
         for turn in [Order::First, Order::Then] {
-            for i in len..self.riders.len() {
+            let first = len;
+            for i in first..self.riders.len() {
                 if len < len_max && order(self.riders[i].client) == Some(turn) {
                     self.riders.swap(len, i);
                     self.descents.swap(len, i);
