@@ -47,9 +47,16 @@ lint: venv ## Formatting, clippy, docs and ruff, all with warnings as errors.
 load: ## Puts load on the server of `make serve`: make load LOAD="--clients 32 --seconds 10"; LOAD=--help tells more.
 	cargo run $(CARGO_FLAGS) --quiet --example load -- $(LOAD)
 
-reliability: build venv ## The figures of docs/reliability.md: make reliability RELIABILITY="hostile overload"; RELIABILITY=--help tells more.
+reliability: build venv reliability-tools ## The figures of docs/reliability.md: make reliability RELIABILITY="hostile overload"; RELIABILITY=--help tells more.
 	cargo build $(CARGO_FLAGS) --examples
 	$(BIN)/python -m tests.reliability $(RELIABILITY)
+
+.PHONY: reliability-tools
+reliability-tools: .venv-reliability/.ready
+.venv-reliability/.ready: tests/reliability/requirements.txt | tools
+	$(PYTHON) -m venv .venv-reliability
+	.venv-reliability/bin/pip install --quiet --disable-pip-version-check -r $<
+	touch $@
 
 bench: ## Kernel, forward, act and training-step times of this machine.
 	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 MALLOC_MMAP_THRESHOLD_=1073741824 MALLOC_TRIM_THRESHOLD_=4294967296 cargo bench --locked

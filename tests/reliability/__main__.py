@@ -8,14 +8,16 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from . import hostile, log, memory, newcomer, overload
+from . import held, hostile, log, memory, newcomer, overload, schema
 from .process import RELEASE, Row
 
 SCENARIOS: dict[str, Callable[[], Iterator[Row]]] = {
     "memory": memory.measure,
+    "held": held.measure,
     "newcomer": newcomer.measure,
     "log": log.measure,
     "hostile": hostile.measure,
+    "schema": schema.measure,
     "overload": overload.measure,
 }
 

@@ -15,10 +15,12 @@ pub struct OpenBody {
     /// `name` or `name@digest`; absent: the default model.
     model: Option<String>,
     /// Seed of all noise; absent: drawn by the server.
+    #[schema(format = "uint64")]
     seed: Option<u64>,
     /// Overrides of the model's sampling defaults.
     options: Option<OptionsBody>,
     /// Idle time to live.
+    #[schema(format = "uint64")]
     ttl_ms: Option<u64>,
     /// The client's name for this request: while the session lives, the same again gives the same session.
     request_id: Option<String>,
@@ -94,6 +96,7 @@ pub struct ActBody {
     /// In a batch and on a stream; elsewhere the path says it.
     pub session_id: Option<String>,
     /// Committed step + 1, or the committed step again.
+    #[schema(format = "uint64")]
     step: u64,
     /// What was seen since the last act.
     observation: ObservationBody,
@@ -102,6 +105,7 @@ pub struct ActBody {
     /// Whether the answer holds `planned_states`.
     want_planned_states: Option<bool>,
     /// The episode that it belongs to; absent: the running one.
+    #[schema(format = "uint64")]
     episode: Option<u64>,
 }
 
@@ -143,12 +147,14 @@ pub struct BatchBody {
 #[serde(deny_unknown_fields, default)]
 pub struct ResetBody {
     /// Seed of the new episode; absent: drawn.
+    #[schema(format = "uint64")]
     seed: Option<u64>,
     /// Whether the latent goes on looking back on the old episode.
     keep_history: Option<bool>,
     /// The client's name for this request: the same again resets nothing.
     request_id: Option<String>,
     /// The episode that it ends; absent: the running one.
+    #[schema(format = "uint64")]
     episode: Option<u64>,
 }
 

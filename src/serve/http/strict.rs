@@ -38,8 +38,16 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for Strict<D> {
         self.0.deserialize_any(Word(visitor))
     }
 
+    fn deserialize_u32<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
+        self.0.deserialize_any(Whole(visitor))
+    }
+
+    fn deserialize_u64<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
+        self.0.deserialize_any(Whole(visitor))
+    }
+
     forward_to_deserialize_any! {
-        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f64 char str string bytes byte_buf unit unit_struct seq tuple tuple_struct map
+        bool i8 i16 i32 i64 i128 u8 u16 u128 f64 char str string bytes byte_buf unit unit_struct seq tuple tuple_struct map
         identifier ignored_any
     }
 }
@@ -56,6 +64,32 @@ impl<'de, V: Visitor<'de>> Visitor<'de> for Object<V> {
 
     fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<V::Value, A::Error> {
         self.0.visit_map(Strict(map))
+    }
+}
+
+/// Takes the place of a count. JSON has one kind of number, so 2.0 is the count 2, as other writers and JSON Schema have it.
+struct Whole<V>(V);
+
+impl<'de, V: Visitor<'de>> Visitor<'de> for Whole<V> {
+    type Value = V::Value;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.expecting(f)
+    }
+
+    fn visit_i64<E: Error>(self, value: i64) -> Result<V::Value, E> {
+        self.0.visit_i64(value)
+    }
+
+    fn visit_u64<E: Error>(self, value: u64) -> Result<V::Value, E> {
+        self.0.visit_u64(value)
+    }
+
+    fn visit_f64<E: Error>(self, value: f64) -> Result<V::Value, E> {
+        // Beyond this a number with a fraction may look whole.
+        const WHOLE_MAX: f64 = 9_007_199_254_740_992.0;
+        let is_whole = value.fract() == 0.0 && (0.0..=WHOLE_MAX).contains(&value);
+        if is_whole { self.0.visit_u64(value as u64) } else { self.0.visit_f64(value) }
     }
 }
 
@@ -159,5 +193,22 @@ impl<'de, S: DeserializeSeed<'de>> DeserializeSeed<'de> for Strict<S> {
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<S::Value, D::Error> {
         self.0.deserialize(Strict(deserializer))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde::Deserialize;
+
+    #[test]
+    fn whole_numbers_are_counts_however_they_are_written() {
+        let read = |text: &str| u64::deserialize(Strict(&mut serde_json::Deserializer::from_str(text))).ok();
+        for (text, count) in [("2", 2), ("2.0", 2), ("2e3", 2000), ("18446744073709551615", u64::MAX)] {
+            assert_eq!(read(text), Some(count), "{text}");
+        }
+        for text in ["2.5", "-1", "-1.0", "1e300", "18446744073709551616", "\"2\"", "null", "[2]", "true"] {
+            assert_eq!(read(text), None, "{text}");
+        }
     }
 }
