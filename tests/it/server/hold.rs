@@ -11,16 +11,25 @@ fn honest(server: &Running) -> (CancellationToken, JoinHandle<u32>) {
     let is_over = stop.clone();
     let work = async move {
         let channel = Channel::from_shared(format!("http://{address}")).unwrap().connect().await.unwrap();
-        let (mut agent, mut rounds) = (AgentClient::new(channel), 0);
+        let (agent, mut rounds) = (AgentClient::new(channel), 0);
         while !is_over.is_cancelled() {
-            let opened = sent(&mut agent, async |agent| agent.open_session(pb::OpenSessionRequest::default()).await).await;
-            let id = opened.expect("an honest open is refused").into_inner().session.unwrap().session_id;
+            let open = || {
+                let mut agent = agent.clone();
+                async move { agent.open_session(pb::OpenSessionRequest::default()).await }
+            };
+            let id = sent(open).await.expect("an honest open is refused").into_inner().session.unwrap().session_id;
             for step in 1..=3 {
-                let acted = sent(&mut agent, async |agent| agent.act(act(&id, step, &STATE)).await).await;
-                acted.expect("an honest act is refused");
+                let act = || {
+                    let (mut agent, request) = (agent.clone(), act(&id, step, &STATE));
+                    async move { agent.act(request).await }
+                };
+                sent(act).await.expect("an honest act is refused");
             }
-            let close = pb::CloseSessionRequest { session_id: id };
-            sent(&mut agent, async |agent| agent.close_session(close.clone()).await).await.unwrap();
+            let close = || {
+                let (mut agent, request) = (agent.clone(), pb::CloseSessionRequest { session_id: id.clone() });
+                async move { agent.close_session(request).await }
+            };
+            sent(close).await.unwrap();
             rounds += 1;
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
@@ -30,12 +39,9 @@ fn honest(server: &Running) -> (CancellationToken, JoinHandle<u32>) {
 }
 
 /// A call, once more if it was never sent: this client does not do so by itself when a connection is asked to leave between two calls.
-async fn sent<T>(
-    agent: &mut AgentClient<Channel>,
-    call: impl AsyncFn(&mut AgentClient<Channel>) -> Result<T, Status>,
-) -> Result<T, Status> {
-    match call(agent).await {
-        Err(status) if status.code() == Code::Cancelled => call(agent).await,
+async fn sent<T, F: Future<Output = Result<T, Status>>>(call: impl Fn() -> F) -> Result<T, Status> {
+    match call().await {
+        Err(status) if status.code() == Code::Cancelled => call().await,
         other => other,
     }
 }
