@@ -201,7 +201,7 @@ impl Default for ServerConfig {
             io_threads: 0,
             connections_max: 4096,
             connections_per_address_max: 2048,
-            held_bytes_max: 16 << 20,
+            held_bytes_max: 8 << 20,
             drain_notice_ms: 250,
             drain_timeout_ms: 10_000,
             hosts: Vec::new(),

@@ -29,7 +29,9 @@ fn honest(server: &Running) -> (CancellationToken, JoinHandle<u32>) {
                 let (mut agent, request) = (agent.clone(), pb::CloseSessionRequest { session_id: id.clone() });
                 async move { agent.close_session(request).await }
             };
-            sent(close).await.unwrap();
+            let closed = sent(close).await;
+            // The first of two may have done it.
+            assert!(closed.as_ref().err().is_none_or(|status| status.code() == Code::NotFound), "{closed:?}");
             rounds += 1;
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
@@ -38,10 +40,11 @@ fn honest(server: &Running) -> (CancellationToken, JoinHandle<u32>) {
     (stop, tokio::spawn(work))
 }
 
-/// A call, once more if it was never sent: this client does not do so by itself when a connection is asked to leave between two calls.
+/// A call, once more if its connection ended under it, as clients do: this one does not by itself when a connection is asked to leave between
+/// two calls.
 async fn sent<T, F: Future<Output = Result<T, Status>>>(call: impl Fn() -> F) -> Result<T, Status> {
     match call().await {
-        Err(status) if status.code() == Code::Cancelled => call().await,
+        Err(status) if matches!(status.code(), Code::Cancelled | Code::Unavailable | Code::Internal | Code::Unknown) => call().await,
         other => other,
     }
 }
