@@ -76,7 +76,16 @@ pub struct Gate {
     client: u64,
     leave: CancellationToken,
     hard_end: CancellationToken,
-    lingers: Arc<AtomicBool>,
+    marks: Arc<Marks>,
+}
+
+/// What is known of a connection while it goes on.
+#[derive(Default)]
+struct Marks {
+    speaks_http1: AtomicBool,
+    /// Its next answer is its last one (HTTP/1).
+    is_old: AtomicBool,
+    lingers: AtomicBool,
 }
 
 impl Gate {
@@ -87,12 +96,12 @@ impl Gate {
 
     /// The connection will close while its peer is sending: see `serve::wire`.
     pub fn linger(&self) {
-        self.lingers.store(true, Ordering::Relaxed);
+        self.marks.lingers.store(true, Ordering::Relaxed);
     }
 
     /// Whether it will.
     pub fn lingers(&self) -> bool {
-        self.lingers.load(Ordering::Relaxed)
+        self.marks.lingers.load(Ordering::Relaxed)
     }
 
     /// Runs it to its end, or to the server's hard end.
@@ -119,7 +128,7 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
                     let activity = held.begin(place.address(), Instant::now());
                     let (place, client) = (Arc::new((place, tracker.token())), activity.number);
                     let (leave, hard_end) = (leave.clone(), hard_end.clone());
-                    let gate = Gate { _place: place, client, leave, hard_end, lingers: Arc::default() };
+                    let gate = Gate { _place: place, client, leave, hard_end, marks: Arc::default() };
                     tokio::spawn(connection(stream, faces.clone(), config.clone(), gate, activity));
                 }
                 None => turn_away(stream),
@@ -190,7 +199,7 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate, act
     let builder = builder(config);
     let wire = Wire::new(stream, gate.clone(), Bounds::new(config));
     let mut connection = pin!(builder.serve_connection_with_upgrades(TokioIo::new(wire), answer));
-    let (mut looks, mut is_leaving) = (interval(look_interval(config)), false);
+    let (mut looks, mut is_leaving, mut is_old) = (interval(look_interval(config)), false, false);
     let mut of_age = pin!(sleep(age_max(&config.connection, activity.number)));
     let [idle_max, leave_max] = [config.connection.idle_timeout_ms, config.connection.keepalive_timeout_ms].map(Duration::from_millis);
     let ended = loop {
@@ -200,9 +209,15 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate, act
                 is_leaving = true;
                 connection.as_mut().graceful_shutdown();
             }
-            () = of_age.as_mut(), if !is_leaving => {
-                is_leaving = true;
-                connection.as_mut().graceful_shutdown();
+            () = of_age.as_mut(), if !is_leaving && !is_old => {
+                is_old = true;
+                // To close between two requests is to cross the next one on its way, which HTTP/1 clients take for a lost answer.
+                if gate.marks.speaks_http1.load(Ordering::Relaxed) {
+                    gate.marks.is_old.store(true, Ordering::Relaxed);
+                } else {
+                    is_leaving = true;
+                    connection.as_mut().graceful_shutdown();
+                }
             }
             () = activity.cut.cancelled() => break Ok(()),
             // One that was asked to leave and has nothing in hand need not stay for as long as others.
@@ -290,6 +305,7 @@ async fn answer(
     let span = tracing::info_span!("request", %id, face, method = %request.method());
     let is_stream = is_grpc && grpc::is_stream(&path);
     let is_http1 = request.version() < Version::HTTP_2;
+    gate.marks.speaks_http1.store(is_http1, Ordering::Relaxed);
     let leave = (is_grpc && endless::is_endless(&path)).then(|| gate.leave.clone());
     let kind = match (is_grpc, is_stream) {
         (true, true) => Kind::Messages,
@@ -328,7 +344,8 @@ async fn answer(
     if let Ok(id) = HeaderValue::from_str(&id) {
         response.headers_mut().insert(REQUEST_ID, id);
     }
-    if is_http1 && gate.lingers() && response.status() == StatusCode::PAYLOAD_TOO_LARGE {
+    let is_last = gate.marks.is_old.load(Ordering::Relaxed) && response.status() != StatusCode::SWITCHING_PROTOCOLS;
+    if is_http1 && (is_last || gate.lingers() && response.status() == StatusCode::PAYLOAD_TOO_LARGE) {
         response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
     }
     if let Some(leave) = &leave {

@@ -1,15 +1,17 @@
 //! How checkpoints are used: gRPC and REST over one core, on one port.
 //!
-//! The way of a request: [`listener`] (bytes) -> [`guard`] (whom it may come from) -> [`grpc`] or [`http`] (convert) -> [`service`] (verbs) -> [`session`] (lease the episode) -> [`engine`]
+//! The way of a request: [`listener`] (bytes, by way of `wire`) -> [`guard`] (whom it may come from) -> [`grpc`] or [`http`] (convert) -> [`service`] (verbs) -> [`session`] (lease the episode) -> [`engine`]
 //! (queue, batch, network evaluations) -> [`session`] (commit) -> bytes.
 
 pub mod config;
 pub mod connections;
+mod count;
 pub mod engine;
 pub mod error;
 pub mod grpc;
 pub mod guard;
 pub mod http;
+pub mod idle;
 pub mod listener;
 pub mod registry;
 pub mod request;

@@ -4,16 +4,18 @@ use crate::{
     model::agent::Episode,
     serve::{
         config::{Config, EngineConfig},
+        count::Count,
         engine::{Engine, EngineOptions, Failure, Job, Patience, Question, Refusal},
         error::{ServiceError, Stage},
+        idle::{Idle, until_idle},
         registry::{Model, Registry, RegistryError},
-        request::{ActRequest, ActResult, Acted, Caller, ListRequest, OpenRequest, Opened, Page, ResetRequest},
+        request::{ActRequest, ActResult, Acted, ListRequest, OpenRequest, Opened, Page, ResetRequest},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
         session::{Answer, Entry, Handle, Opening, Session, Sessions, Summary, Untold, Waiter, key_of},
         telemetry,
     },
 };
-use futures_util::{Stream, StreamExt, future::join_all, stream};
+use futures_util::{Stream, StreamExt, future::join_all};
 use std::{
     sync::{
         Arc, OnceLock,
@@ -21,7 +23,7 @@ use std::{
     },
     time::{Duration, Instant},
 };
-use tokio::time::{timeout, timeout_at};
+use tokio::time::timeout_at;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
@@ -178,7 +180,7 @@ impl Service {
     /// # Errors
     /// Every row of the error table; the session is as before, but see `Deadline`.
     pub async fn act(&self, request: ActRequest) -> Result<Acted, ServiceError> {
-        let mut count = Count { arrived: Instant::now(), caller: request.caller, model: "unknown".to_owned(), is_told: false };
+        let mut count = Count::new(request.caller);
         let session = self.registry().and_then(|_| self.session(&request.session_id));
         if let Err(ServiceError::Draining { .. }) = &session
             && let Some(acted) = self.committed(&request)
@@ -187,8 +189,8 @@ impl Service {
         }
         let result = match session {
             Ok(session) => {
-                count.model = session.model.to_string();
-                self.act_on(&session, request, count.arrived).await
+                count.of(&session.model);
+                self.act_on(&session, request, count.arrived()).await
             }
             Err(error) => Err(error),
         };
@@ -377,31 +379,6 @@ impl Service {
     }
 }
 
-/// Why an ActStream ends of which nothing was asked for `connection.idle_timeout_ms`, while nothing was in work: it holds a place.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Idle;
-
-/// The results, of so many acts as are in work, until none comes and none is to be expected.
-fn until_idle<T>(results: impl Stream<Item = T>, in_work: Arc<AtomicUsize>, idle_max: Duration) -> impl Stream<Item = Result<T, Idle>> {
-    stream::unfold(Some(Box::pin(results)), move |results| {
-        let in_work = in_work.clone();
-        async move {
-            let mut results = results?;
-            loop {
-                match timeout(idle_max, results.next()).await {
-                    Ok(None) => return None,
-                    Ok(Some(result)) => {
-                        in_work.fetch_sub(1, Ordering::Relaxed);
-                        return Some((Ok(result), Some(results)));
-                    }
-                    Err(_) if in_work.load(Ordering::Relaxed) == 0 => return Some((Err(Idle), None)),
-                    Err(_) => {}
-                }
-            }
-        }
-    })
-}
-
 /// The outcome, also one that comes at the very moment of the deadline: what is committed is told.
 async fn wait(waiter: Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {
     if let Ok(outcome) = timeout_at(deadline.into(), waiter.outcome()).await {
@@ -424,56 +401,4 @@ fn check_request_id(id: &str) -> Result<(), ServiceError> {
 fn draw_seed() -> u64 {
     let random_low_bits = Uuid::new_v4().as_u128() as u64;
     random_low_bits & ((1 << DRAWN_SEED_BITS) - 1)
-}
-
-/// An act on its way through the metrics: whatever becomes of it is counted once, and also that nobody waited for it any more.
-struct Count {
-    arrived: Instant,
-    caller: Caller,
-    model: String,
-    is_told: bool,
-}
-
-impl Count {
-    fn told(mut self, result: Result<Acted, ServiceError>) -> Result<Acted, ServiceError> {
-        self.is_told = true;
-        self.count(result.as_ref().map_or_else(ServiceError::reason, |_| "OK"));
-        match &result {
-            Ok(acted) => self.answered(acted),
-            Err(error) => {
-                if error.committed_step().is_some() {
-                    metrics::counter!("ada_step_conflicts_total", "reason" => error.reason()).increment(1);
-                }
-                if matches!(error, ServiceError::QueueFull { .. } | ServiceError::Deadline { stage: Stage::Admission | Stage::Queue }) {
-                    metrics::counter!("ada_shed_total", "reason" => error.reason()).increment(1);
-                }
-                tracing::debug!(reason = error.reason(), %error, "act refused");
-            }
-        }
-        result
-    }
-
-    fn answered(&self, Acted { answer, replayed, .. }: &Acted) {
-        metrics::histogram!("ada_act_duration_seconds", "model" => self.model.clone()).record(self.arrived.elapsed().as_secs_f64());
-        if !replayed {
-            let Answer { chunk, timings, .. } = &**answer;
-            metrics::histogram!("ada_act_queue_seconds").record(timings.queue.as_secs_f64());
-            metrics::histogram!("ada_act_compute_seconds").record(timings.compute.as_secs_f64());
-            metrics::histogram!("ada_act_commit_seconds").record(timings.commit.as_secs_f64());
-            metrics::histogram!("ada_act_network_evaluations").record(f64::from(chunk.evaluations));
-        }
-    }
-
-    fn count(&self, code: &'static str) {
-        let (model, face) = (self.model.clone(), self.caller.face.word());
-        metrics::counter!("ada_acts_total", "model" => model, "face" => face, "code" => code).increment(1);
-    }
-}
-
-impl Drop for Count {
-    fn drop(&mut self) {
-        if !self.is_told {
-            self.count("CANCELLED");
-        }
-    }
 }

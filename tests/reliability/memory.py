@@ -22,7 +22,7 @@ FULL = 2000
 def measure() -> Iterator[Row]:
     with Server("models.default=tiny") as server, Client(server.url) as client:
         yield from _memory(server, client)
-    with Server("models.default=tiny", f"sessions.len_max={FULL}") as server:
+    with Server("models.default=tiny", f"sessions.len_max={FULL}", "sessions.evict_idle_ms=600000") as server:
         yield _refusal(server)
 
 

@@ -12,6 +12,8 @@ from contextlib import suppress
 from .process import Row, Server, open_files_max
 
 ATTACKERS = 4096
+#: `server.connections_per_address_max`, but for those that the server has closed by then.
+HELD = 2000
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 SETTINGS = b"\x00\x00\x00\x04\x00\x00\x00\x00\x00"
 HALF_BODY = b"POST /v1/sessions HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: 1000\r\n\r\n{"
@@ -33,6 +35,9 @@ def measure() -> Iterator[Row]:
             if words.startswith(PREFACE):
                 pinged.start()
             time.sleep(0.5)
+            yield Row(
+                "newcomer", f"{ATTACKERS} attackers, {kind}: places they hold", server.metric("ada_connections"), HELD, "", at_least=True
+            )
             yield Row("newcomer", f"{ATTACKERS} attackers, {kind}: another's open and act", _newcomer(server.port), 1, "s")
             over.set()
             if pinged.is_alive():
@@ -56,7 +61,7 @@ def _answer_pings(held: list[socket.socket], over: threading.Event) -> None:
             with suppress(OSError):
                 heard = attacker.recv(4096)
                 while len(heard) >= 9:
-                    length, kind, flags = int.from_bytes(heard[:3]), heard[3], heard[4]
+                    length, kind, flags = int.from_bytes(heard[:3], "big"), heard[3], heard[4]
                     frame, heard = heard[9 : 9 + length], heard[9 + length :]
                     if kind == 6 and not flags & 1:
                         attacker.sendall(struct.pack(">I", 8)[1:] + b"\x06\x01\x00\x00\x00\x00" + frame)

@@ -21,6 +21,8 @@ ROOT = Path(__file__).parents[2]
 RELEASE = ROOT / "target" / "release"
 START_S = 60.0
 MB = 1e6
+#: Settings of every server, to see a check fail (`--set`).
+EXTRA: list[str] = []
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,13 @@ class Server:
         self,
         *settings: str,
         models: Path = ROOT / "models",
-        log: int | IO[str] = subprocess.PIPE,
+        log: int | IO[str] = subprocess.DEVNULL,
         cores: Iterable[int] = (),
+        program: Path = RELEASE / "ada-server",
     ) -> None:
         address = f"127.0.0.1:{_free_port()}"
-        command = [*on_cores(cores), str(RELEASE / "ada-server"), "--models", str(models), "--listen", address]
-        for setting in ("telemetry.format=json", *settings):
+        command = [*on_cores(cores), str(program), "--models", str(models), "--listen", address]
+        for setting in ("telemetry.format=json", *settings, *EXTRA):
             command += ["--set", setting]
         open_files_max()
         self.process = subprocess.Popen(command, stderr=log, text=True)
@@ -83,6 +86,11 @@ class Server:
         """Value of a metric, all labels together."""
         text = urllib.request.urlopen(f"{self.url}/metrics", timeout=10).read().decode()
         return sum(float(value) for value in re.findall(rf"^{name}(?:{{[^}}]*}})? (\S+)$", text, re.M))
+
+    def models(self) -> set[str]:
+        """Names of the models that it serves."""
+        answer = json.load(urllib.request.urlopen(f"{self.url}/v1/models", timeout=10))
+        return {model["name"] for model in answer["models"]}
 
     def memory(self, which: str = "VmRSS") -> float:
         """Bytes."""
@@ -113,6 +121,11 @@ class Server:
     def __exit__(self, *_: object) -> None:
         self.process.kill()
         self.process.wait()
+
+
+def refused_by(event: dict[str, Any]) -> str | None:
+    """The checkpoint that this line of the log says is refused."""
+    return str(event["model"]) if event.get("level") == "ERROR" and event.get("message") == "checkpoint refused" else None
 
 
 def load(server: Server, *words: object, cores: Iterable[int] = ()) -> subprocess.Popen[str]:

@@ -71,7 +71,8 @@ pub struct ConnectionConfig {
     /// A connection without any request, or a stream without any act, for so long is asked to leave, whatever pings it answers.
     pub idle_timeout_ms: u64,
     /// A connection of this age, give or take a tenth, is asked to leave: what is in flight goes on, streams for as long as they like, and new
-    /// requests come by a new connection. So load spreads again where servers were added behind one name.
+    /// requests come by a new connection. Over HTTP/1 its next answer says so (`connection: close`). So load spreads again where servers were added
+    /// behind one name.
     pub age_max_ms: u64,
     /// Bytes of all headers of a request.
     pub header_bytes_max: u32,

@@ -232,7 +232,7 @@ impl<T: Ticket> Engine<T> {
 
     /// How long an act that comes now and has its turn last would wait.
     pub fn expected_wait(&self) -> Duration {
-        self.shared.queue.expected_wait().0
+        self.shared.queue.expected_wait()
     }
 
     /// Acts that wait, and acts in batches.
@@ -278,10 +278,10 @@ impl<T: Ticket> Shared<T> {
             Ask { turn_by: job.turn_by, client: job.client, work: Duration::ZERO, bytes, wait_max: Duration::MAX, useful: Duration::MAX };
         let Some(costs) = self.tariff.of(&job.agent) else { return Some(ask) };
         let (evaluations, patience) = (job.descent.evaluations_left(), job.ticket.patience());
-        let ((waiting, running), (_, slowness)) = (self.queue.load(), self.queue.expected_wait());
+        let ((waiting, running), slowness) = (self.queue.load(), self.queue.slowness());
         let batch = ((waiting + running) / self.options.workers + 1).min(self.options.batch_len_max);
         // One that may be degraded needs time for a single evaluation.
-        let least = costs.act(if patience.due.is_some() { 1 } else { evaluations }, batch).mul_f64(slowness.max(1.0));
+        let least = costs.act(if patience.due.is_some() { 1 } else { evaluations }, batch).mul_f64(slowness);
         let left = patience.ends.map(|ends| ends.saturating_duration_since(Instant::now()));
         // And takes no more than it has, which it shares with a full batch.
         let hurried = patience.due.and(left).map(|left| left / self.options.batch_len_max as u32);

@@ -283,10 +283,16 @@ impl<J> Queue<J> {
         (inner.jobs.len(), inner.running.iter().sum())
     }
 
-    /// How long one who comes now and has its turn last would wait, and how many times slower work is than warm-up promised.
-    pub fn expected_wait(&self) -> (Duration, f64) {
+    /// How long one who comes now and has its turn last would wait.
+    pub fn expected_wait(&self) -> Duration {
+        self.inner.lock().excess(Duration::ZERO)
+    }
+
+    /// How many times slower work is than warm-up promised. While nobody waits nothing is measured, and what was once slow must not refuse
+    /// acts for ever: then it is as promised.
+    pub fn slowness(&self) -> f64 {
         let inner = self.inner.lock();
-        (inner.excess(Duration::ZERO), inner.pace.now / inner.pace.promised)
+        if inner.jobs.is_empty() { 1.0 } else { (inner.pace.now / inner.pace.promised).max(1.0) }
     }
 
     /// Ends the queue and gives back what waits in it.

@@ -116,7 +116,7 @@ fn admitted_by_expected_wait() {
     assert!(queue.put(10, Ask { wait_max: ms(100), ..late }).is_ok());
     assert!(queue.put(11, Ask { turn_by: now + ms(40), client: 98, wait_max: ms(0), ..late }).is_ok(), "the first of all waits for nobody");
     assert_eq!(queue.take_any(0, 0, 1), Some(vec![11]));
-    assert_eq!(queue.expected_wait(), (ms(110), 1.0));
+    assert_eq!((queue.expected_wait(), queue.slowness()), (ms(110), 1.0));
 }
 
 /// One client's hundred acts wait behind one another, so another's one act has its turn soon; and where they have filled the queue the last
@@ -150,6 +150,18 @@ fn places_are_kept_for_the_light() {
     assert_eq!(queue.take(0, 8, room(0, 0), heavy), Some(vec![]));
     assert_eq!(queue.take(0, 0, room(1, 2), heavy), Some(vec![0, 5]));
     assert_eq!(queue.take(0, 0, room(9, 2), heavy), Some(vec![1, 3]));
+}
+
+/// After a hiccup the pace is slow, and if it counted while nobody waits, acts would be refused that nothing would ever measure again.
+#[test]
+fn a_pace_of_the_past_counts_only_while_others_wait() {
+    let (queue, now) = (queue(9, 1), Instant::now());
+    queue.inner.lock().pace.now = 8.0;
+    assert_eq!(queue.slowness(), 1.0);
+    let place = queue.put(1, ask(now, 1)).unwrap();
+    assert_eq!(queue.slowness(), 8.0);
+    queue.withdraw(place);
+    assert_eq!(queue.slowness(), 1.0);
 }
 
 /// The pace is what it was seen to be while others waited, and what warm-up promised before.

@@ -90,6 +90,8 @@ impl<T: Ticket> Batch<T> {
         if let Some(costs) = &group.costs {
             let needs = costs.act(descent.evaluations_left(), len).mul_f64(slowness);
             if is_late(ticket.patience(), needs, margin) {
+                // It told nothing about the machine, and if all are late nothing would.
+                self.slowness.forget();
                 return ticket.settle(Err(Failure::Late));
             }
         }
@@ -330,6 +332,65 @@ fn guarded<R>(work: impl FnOnce() -> Result<R, AgentError>) -> Result<R, Failure
         Err(_) => {
             metrics::counter!("ada_engine_panics_total").increment(1);
             Err(Failure::Panic)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{agent::Observation, checkpoint};
+    use std::{path::Path, sync::mpsc};
+
+    /// Waits until the time is over, and says what came of it.
+    struct Waits(Instant, mpsc::Sender<Result<Finished, Failure>>);
+
+    impl Ticket for Waits {
+        fn is_wanted(&self) -> bool {
+            true
+        }
+
+        fn start(&self) {}
+
+        fn patience(&self) -> Patience {
+            Patience { due: None, ends: Some(self.0) }
+        }
+
+        fn settle(self, outcome: Result<Finished, Failure>) {
+            self.1.send(outcome).unwrap();
+        }
+    }
+
+    /// A worker that was slow for a while refuses a few acts for it, and then tries again: what it does not compute it cannot measure.
+    #[test]
+    fn a_slow_time_does_not_refuse_for_ever() {
+        let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
+        let options = EngineOptions {
+            workers: 1,
+            queue_len_max: 1,
+            queue_bytes_max: 1,
+            batch_len_max: 1,
+            deadline_margin: Duration::ZERO,
+            wait_max: Duration::ZERO,
+        };
+        let (mut batch, tariff) = (Batch::new(options), Tariff::default());
+        batch.warm_up(&agent, &tariff, || true).unwrap();
+        (0..100).for_each(|_| batch.slowness.note(Duration::from_secs(1), Duration::from_millis(1)));
+        let (told, outcome) = mpsc::channel();
+        let mut late = 0;
+        while batch.len() == 0 {
+            let question = Question {
+                episode: Arc::new(agent.open(1, &agent.spec().sampler).unwrap()),
+                observation: Observation { state: vec![0.1; 4], ..Observation::default() },
+            };
+            let descent = question.begin(&agent).unwrap();
+            // Twice what it takes, and so half of what it would take at the worker's slowness.
+            let needs = tariff.of(&agent).unwrap().act(descent.evaluations_left(), 1);
+            let now = Instant::now();
+            let ticket = Waits(now + 2 * needs + Duration::from_micros(200), told.clone());
+            batch.admit(Job { agent: agent.clone(), question, descent, ticket, submitted: now, turn_by: now, client: 0 }, 1, &tariff);
+            late += outcome.try_iter().filter(|outcome| matches!(outcome, Err(Failure::Late))).count();
+            assert!(late < 1000, "it never tries again");
         }
     }
 }

@@ -24,6 +24,7 @@ pub(super) struct Turns {
     acts: Vec<(u64, usize)>,
     /// Acts above which a client is heavy.
     heavy: usize,
+    has_heavy: bool,
     /// Seconds that each light client has had more than each heavy one.
     lead: f64,
 }
@@ -31,7 +32,7 @@ pub(super) struct Turns {
 impl Turns {
     /// For batches of up to so many acts.
     pub fn new(batch_len_max: usize) -> Self {
-        Self { acts: Vec::with_capacity(batch_len_max), heavy: batch_len_max / HEAVY_SHARE, lead: 0.0 }
+        Self { acts: Vec::with_capacity(batch_len_max), heavy: batch_len_max / HEAVY_SHARE, has_heavy: false, lead: 0.0 }
     }
 
     /// Takes note of who holds what.
@@ -43,16 +44,17 @@ impl Turns {
                 None => self.acts.push((client, 1)),
             }
         }
+        self.has_heavy = self.acts.iter().any(|(_, acts)| *acts > self.heavy);
     }
 
     /// Places beyond the batch that are kept for light clients while a heavy one fills it.
     pub fn reserve(&self) -> usize {
-        if self.clients().0 > 0 { self.heavy } else { 0 }
+        if self.has_heavy { self.heavy } else { 0 }
     }
 
     /// Whether a client holds more than its share.
     pub fn is_heavy(&self, client: u64) -> bool {
-        self.acts.iter().any(|(known, acts)| *known == client && *acts > self.heavy)
+        self.has_heavy && self.acts.iter().any(|(known, acts)| *known == client && *acts > self.heavy)
     }
 
     /// Who takes part in the next tick. The light ones may be ahead by `credit` at most.

@@ -14,9 +14,10 @@ pub mod pb {
 
 use crate::serve::{
     error::{ServiceError, Stage},
+    idle::Idle,
     listener::Gate,
     request::{ActResult, Opened},
-    service::{Idle, Service},
+    service::Service,
 };
 use axum::{http::HeaderMap, middleware, response::Response as HttpResponse};
 use futures_util::{Stream, StreamExt};

@@ -101,6 +101,7 @@ pub struct ActBody {
     /// What was seen since the last act.
     observation: ObservationBody,
     /// Time that it may take from its arrival, after which a coarser answer in time is better than none.
+    #[schema(format = "uint32")]
     deadline_ms: Option<u32>,
     /// Whether the answer holds `planned_states`.
     want_planned_states: Option<bool>,

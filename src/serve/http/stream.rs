@@ -10,8 +10,9 @@ use super::{
 use crate::serve::{
     config::ConnectionConfig,
     error::ServiceError,
+    idle::Idle,
     request::{ActRequest, ActResult},
-    service::{Idle, Service},
+    service::Service,
 };
 use axum::{
     body::Bytes,

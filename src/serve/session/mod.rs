@@ -2,20 +2,21 @@
 
 mod flight;
 mod handle;
+mod key;
 mod table;
 mod untold;
 
 pub use flight::{Flight, Waiter};
 pub use handle::Handle;
+pub use key::{Key, key_of};
 pub use table::Sessions;
 pub use untold::Untold;
 
 use crate::{
-    model::agent::{Agent, Chunk, Episode, Executed, Observation, SamplerOptions},
+    model::agent::{Agent, Chunk, Episode, SamplerOptions},
     serve::{engine::Patience, error::ServiceError},
 };
 use parking_lot::Mutex;
-use sha2::{Digest, Sha256};
 use std::{
     collections::VecDeque,
     sync::{
@@ -28,9 +29,6 @@ use uuid::Uuid;
 
 /// Resets of a session that are known by name.
 const RESET_IDS_MAX: usize = 16;
-
-/// SHA-256 of an observation: what "the same observation" means for a repeated step.
-pub type Key = [u8; 32];
 
 /// What becomes of an act: the answer, shared by all who wait for it, or why there is none.
 pub type Outcome = Result<Arc<Answer>, ServiceError>;
@@ -414,60 +412,5 @@ impl Slot {
             self.flight = None;
         }
         held && !self.ended
-    }
-}
-
-/// Key of an observation: every value by its bits, every absence by a mark, every list by its length.
-pub fn key_of(observation: &Observation) -> Key {
-    let Observation { state, executed, nothing_executed } = observation;
-    let mut hash = Sha256::new();
-    hash.update([u8::from(*nothing_executed)]);
-    let mut put = |values: Option<&[f32]>| {
-        hash.update(values.map_or(u64::MAX, |values| values.len() as u64).to_le_bytes());
-        for value in values.into_iter().flatten() {
-            hash.update(value.to_bits().to_le_bytes());
-        }
-    };
-    put(Some(state));
-    for Executed { state, action, reward } in executed {
-        put(state.as_deref());
-        put(action.as_deref());
-        put(reward.as_ref().map(std::slice::from_ref));
-    }
-    hash.finalize().into()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Whatever differs in meaning differs in key, also where the flat list of numbers is the same.
-    #[test]
-    fn keys_tell_observations_apart() {
-        let step = |state: Option<&[f32]>, action: Option<&[f32]>, reward| Executed {
-            state: state.map(<[f32]>::to_vec),
-            action: action.map(<[f32]>::to_vec),
-            reward,
-        };
-        let told = |executed| Observation { state: vec![1.0], executed, ..Observation::default() };
-        let observations = [
-            Observation { state: vec![1.0, 2.0], ..Observation::default() },
-            Observation { state: vec![1.0], ..Observation::default() },
-            Observation { state: vec![1.0], nothing_executed: true, ..Observation::default() },
-            told(vec![step(Some(&[2.0]), None, None)]),
-            told(vec![step(None, Some(&[2.0]), None)]),
-            told(vec![step(None, None, Some(2.0))]),
-            told(vec![step(None, None, None)]),
-            told(vec![step(Some(&[]), None, None)]),
-            told(vec![step(None, None, None), step(None, None, None)]),
-            Observation { state: vec![0.0], ..Observation::default() },
-            Observation { state: vec![-0.0], ..Observation::default() },
-        ];
-        for (i, a) in observations.iter().enumerate() {
-            assert_eq!(key_of(a), key_of(&a.clone()));
-            for b in &observations[..i] {
-                assert_ne!(key_of(a), key_of(b), "{a:?} {b:?}");
-            }
-        }
     }
 }

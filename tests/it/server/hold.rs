@@ -128,6 +128,33 @@ async fn connections_of_age_leave_unnoticed() {
     assert!(work.await.expect("the honest one was disturbed") > 10);
 }
 
+/// Over HTTP/1 a connection that closed between two requests crossed the next one: a client that does not send again lost it.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_old_connection_says_with_an_answer_that_it_is_the_last() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let server = start(|config| config.connection.age_max_ms = 100).await;
+    let (begin, mut answers, mut connections) = (Instant::now(), 0, 0);
+    while begin.elapsed() < Duration::from_millis(1500) {
+        let mut stream = TcpStream::connect(server.address).await.unwrap();
+        connections += 1;
+        loop {
+            stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n").await.unwrap();
+            let mut answer = vec![0; 4096];
+            let len = stream.read(&mut answer).await.unwrap();
+            assert!(len > 0, "it closed on a request, after {answers} answers");
+            answers += 1;
+            let is_last = String::from_utf8_lossy(&answer[..len]).contains("connection: close");
+            if is_last {
+                assert_eq!(stream.read(&mut answer).await.unwrap(), 0, "and then it closes");
+                break;
+            }
+            // Longer than it takes to be closed in between.
+            tokio::time::sleep(Duration::from_millis(15)).await;
+        }
+    }
+    assert!((8..=40).contains(&connections) && answers > 2 * connections, "{connections} {answers}");
+}
+
 /// Memory of a process, in KiB.
 fn resident(process: &Process) -> u64 {
     let status = fs::read_to_string(format!("/proc/{}/status", process.0.id())).unwrap();
