@@ -7,7 +7,12 @@ use super::*;
 #[tokio::test(flavor = "multi_thread")]
 async fn every_act_and_every_evaluation_is_counted_once() {
     let (_process, server) = start_process(&["engine.workers=2", "engine.batch_len_max=4"]).await;
-    let (mut told, mut sent) = (0, 0);
+    // One is hung up on in the middle, so that something is in vain.
+    let slow = server.open(json!({"model": "slow"})).await;
+    let in_vain = server.start_slow(&slow).await;
+    while server.metric("ada_batches_total").await < 1.0 {}
+    in_vain.abort();
+    let (mut told, mut sent) = (0, 1);
     let mut clients = tokio::task::JoinSet::new();
     for client in 0..12_u64 {
         let id = server.open(json!({"seed": client, "options": {"sub_steps": 5}})).await;
