@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -42,14 +43,27 @@ def main() -> int:
             parser.error(f"no scenario {name}: there are {', '.join(SCENARIOS)}")
     if not (RELEASE / "ada-server").exists():
         parser.error(f"no server in {RELEASE}: build it with `make reliability`")
-    rows = []
-    for name in chosen:
+    rows: list[Row] = []
+    broken = [name for name in chosen if not _measure(name, rows, flags.json)]
+    if broken:
+        print(f"not measured to the end: {', '.join(broken)}", file=sys.stderr)
+    return 0 if not broken and all(row.passes for row in rows) else 1
+
+
+def _measure(name: str, rows: list[Row], file: Path | None) -> bool:
+    """Appends the rows of one scenario; false if it broke, which costs its own rows, not those of the others."""
+    measured = []
+    try:
         for row in SCENARIOS[name]():
             print(row, flush=True)
-            rows.append(row)
-        if flags.json:
-            _keep(flags.json, rows)
-    return 0 if all(row.passes for row in rows) else 1
+            measured.append(row)
+    except Exception:
+        traceback.print_exc()
+        return False
+    rows.extend(measured)
+    if file:
+        _keep(file, rows)
+    return True
 
 
 def _keep(file: Path, rows: list[Row]) -> None:

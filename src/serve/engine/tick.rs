@@ -5,7 +5,7 @@ use super::{
     cost::{Costs, Slowness, Tariff},
     turns::{Part, Turns},
 };
-use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode};
+use crate::model::agent::{Act, Agent, AgentError, Chunk, Episode};
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
@@ -20,12 +20,12 @@ pub(super) struct Batch<T> {
     turns: Turns,
 }
 
-/// Acts of one model; `descents[i]` belongs to `riders[i]`.
+/// Acts of one model; `acts[i]` belongs to `riders[i]`.
 struct Group<T> {
     agent: Arc<Agent>,
     /// None for a model without warm-up: its acts are never hurried.
     costs: Option<Arc<Costs>>,
-    descents: Vec<Descent>,
+    acts: Vec<Act>,
     riders: Vec<Rider<T>>,
 }
 
@@ -81,22 +81,25 @@ impl<T: Ticket> Batch<T> {
 
     /// Takes an act into a batch that will have this length; it takes part from the next tick on. One that would come too late is not begun.
     pub fn admit(&mut self, job: Job<T>, len: usize, tariff: &Tariff) {
-        let Job { agent, question, descent, ticket, submitted, turn_by: _, client } = job;
+        let Job { agent, question, act, ticket, submitted, turn_by: _, client } = job;
         if !ticket.is_wanted() {
             return;
         }
-        let (slowness, margin) = (self.slowness.get(), self.options.deadline_margin);
+        let (slowness, margin, idle) = (self.slowness.get(), self.options.deadline_margin, self.len() == 0);
         let group = self.group(agent, tariff);
         if let Some(costs) = &group.costs {
-            let needs = costs.act(descent.evaluations_left(), len).mul_f64(slowness);
+            let needs = costs.act(act.evaluations_left(), len).mul_f64(slowness);
             if is_late(ticket.patience(), needs, margin) {
-                // It told nothing about the machine, and if all are late nothing would.
-                self.slowness.forget();
+                // It tells nothing about the machine, and if nobody else is computed nothing would. While others are, they tell: to forget
+                // for each of a crowd that is late would let the next ones in that are late too.
+                if idle {
+                    self.slowness.forget();
+                }
                 return ticket.settle(Err(Failure::Late));
             }
         }
         ticket.start();
-        group.descents.push(descent);
+        group.acts.push(act);
         group.riders.push(Rider { question, ticket, client, submitted, started: Instant::now() });
     }
 
@@ -129,7 +132,7 @@ impl<T: Ticket> Batch<T> {
     /// Drops all acts, half done as they are; their tickets know what to do. What was measured stays.
     pub fn abandon(&mut self) {
         for group in self.groups.drain(..) {
-            group.descents.iter().for_each(count_waste);
+            group.acts.iter().for_each(count_waste);
             for rider in group.riders {
                 // The one that panicked may do so again when it is dropped.
                 drop(catch_unwind(AssertUnwindSafe(|| drop(rider))));
@@ -140,7 +143,7 @@ impl<T: Ticket> Batch<T> {
     /// The end: whoever is left fails.
     pub fn stop(self) {
         for group in self.groups {
-            group.descents.iter().for_each(count_waste);
+            group.acts.iter().for_each(count_waste);
             group.riders.into_iter().for_each(|rider| rider.ticket.settle(Err(Failure::Stopped)));
         }
     }
@@ -149,7 +152,7 @@ impl<T: Ticket> Batch<T> {
         let index = self.groups.iter().position(|group| Arc::ptr_eq(&group.agent, &agent));
         let index = index.unwrap_or_else(|| {
             let costs = tariff.of(&agent);
-            self.groups.push(Group { agent, costs, descents: Vec::new(), riders: Vec::new() });
+            self.groups.push(Group { agent, costs, acts: Vec::new(), riders: Vec::new() });
             self.groups.len() - 1
         });
         &mut self.groups[index]
@@ -166,9 +169,9 @@ impl<T: Ticket> Group<T> {
             return;
         }
         let (begin, expected) = (Instant::now(), self.expected_of(len));
-        if advance(&self.agent, &mut self.descents[..len]).is_err() {
-            // Whose fault it was is unknown, and the descents may be half advanced: each act starts again, alone.
-            self.descents.drain(..len).for_each(|descent| count_waste(&descent));
+        if advance(&self.agent, &mut self.acts[..len]).is_err() {
+            // Whose fault it was is unknown, and the acts may be half advanced: each act starts again, alone.
+            self.acts.drain(..len).for_each(|act| count_waste(&act));
             for rider in self.riders.drain(..len) {
                 rider.ride_alone(&self.agent, self.costs.as_deref(), pace);
             }
@@ -188,7 +191,7 @@ impl<T: Ticket> Group<T> {
             for i in first..self.riders.len() {
                 if len < len_max && order(self.riders[i].client) == Some(turn) {
                     self.riders.swap(len, i);
-                    self.descents.swap(len, i);
+                    self.acts.swap(len, i);
                     len += 1;
                 }
             }
@@ -203,7 +206,7 @@ impl<T: Ticket> Group<T> {
 
     /// The same of the first ones.
     fn expected_of(&self, len: usize) -> Duration {
-        let fresh = self.descents[..len].iter().filter(|descent| descent.evaluations() == 0).count();
+        let fresh = self.acts[..len].iter().filter(|act| act.evaluations() == 0).count();
         self.costs.as_ref().map_or(Duration::ZERO, |costs| costs.tick(len, fresh))
     }
 
@@ -212,15 +215,15 @@ impl<T: Ticket> Group<T> {
         let Some(costs) = &self.costs else { return };
         for i in (0..self.riders.len()).rev() {
             let batch = (costs.as_ref(), self.riders.len(), slowness.get());
-            match self.riders[i].hurry(&self.agent, &mut self.descents[i], batch, pace) {
+            match self.riders[i].hurry(&self.agent, &mut self.acts[i], batch, pace) {
                 Ok(Hurry::Cut) => slowness.forget(),
                 Ok(Hurry::Goes) => {}
                 Ok(Hurry::Late) => {
-                    count_waste(&self.descents.swap_remove(i));
+                    count_waste(&self.acts.swap_remove(i));
                     self.riders.swap_remove(i).ticket.settle(Err(Failure::Late));
                 }
                 Err(_) => {
-                    count_waste(&self.descents.swap_remove(i));
+                    count_waste(&self.acts.swap_remove(i));
                     self.riders.swap_remove(i).ride_alone(&self.agent, None, pace);
                 }
             }
@@ -231,16 +234,16 @@ impl<T: Ticket> Group<T> {
         for i in (0..self.riders.len()).rev() {
             if !self.riders[i].ticket.is_wanted() {
                 self.riders.swap_remove(i);
-                count_waste(&self.descents.swap_remove(i));
+                count_waste(&self.acts.swap_remove(i));
             }
         }
     }
 
     fn harvest(&mut self) {
         for i in (0..self.riders.len()).rev() {
-            if self.descents[i].is_done() {
-                let descent = self.descents.swap_remove(i);
-                self.riders.swap_remove(i).settle(finish(&self.agent, descent));
+            if self.acts[i].is_done() {
+                let act = self.acts.swap_remove(i);
+                self.riders.swap_remove(i).settle(finish(&self.agent, act));
             }
         }
     }
@@ -248,45 +251,45 @@ impl<T: Ticket> Group<T> {
 
 impl<T: Ticket> Rider<T> {
     /// See [`Group::hurry`]; the batch is its costs, length and slowness.
-    fn hurry(&self, agent: &Agent, descent: &mut Descent, batch: (&Costs, usize, f64), pace: Pace) -> Result<Hurry, Failure> {
+    fn hurry(&self, agent: &Agent, act: &mut Act, batch: (&Costs, usize, f64), pace: Pace) -> Result<Hurry, Failure> {
         let (patience, (costs, len, slowness)) = (self.ticket.patience(), batch);
         let Some(due) = patience.due else {
-            descent.allow(None);
+            act.allow(None);
             // In the best case; what was computed already is lost with it.
-            let needs = costs.tick(len, 0) * descent.evaluations_left() as u32;
+            let needs = costs.tick(len, 0) * act.evaluations_left() as u32;
             return Ok(if is_late(patience, needs, Duration::ZERO) { Hurry::Late } else { Hurry::Goes });
         };
         let left = due.saturating_duration_since(Instant::now()).saturating_sub(pace.margin);
-        let ticks = costs.ticks_within(left, (len, descent.evaluations() > 0), pace.others, slowness);
-        if ticks == 0 && guarded(|| Ok(agent.cut_short(descent)))? {
+        let ticks = costs.ticks_within(left, (len, act.evaluations() > 0), pace.others, slowness);
+        if ticks == 0 && guarded(|| Ok(agent.cut_short(act)))? {
             return Ok(Hurry::Cut);
         }
-        descent.allow(Some(ticks));
+        act.allow(Some(ticks));
         Ok(Hurry::Goes)
     }
 
     /// The whole act without batch mates, from the beginning: the result is the same, for noise does not depend on the batch.
     fn ride_alone(self, agent: &Agent, costs: Option<&Costs>, pace: Pace) {
-        let mut descent = match guarded(|| self.question.begin(agent)) {
-            Ok(descent) => descent,
+        let mut act = match guarded(|| self.question.begin(agent)) {
+            Ok(act) => act,
             Err(failure) => return self.ticket.settle(Err(failure)),
         };
-        while !descent.is_done() {
+        while !act.is_done() {
             if !self.ticket.is_wanted() {
-                return count_waste(&descent);
+                return count_waste(&act);
             }
-            let hurried = costs.map_or(Ok(Hurry::Goes), |costs| self.hurry(agent, &mut descent, (costs, 1, 1.0), pace));
+            let hurried = costs.map_or(Ok(Hurry::Goes), |costs| self.hurry(agent, &mut act, (costs, 1, 1.0), pace));
             let advanced = hurried.and_then(|hurry| match hurry {
-                Hurry::Goes => advance(agent, std::slice::from_mut(&mut descent)),
+                Hurry::Goes => advance(agent, std::slice::from_mut(&mut act)),
                 Hurry::Cut => Ok(()),
                 Hurry::Late => Err(Failure::Late),
             });
             if let Err(failure) = advanced {
-                count_waste(&descent);
+                count_waste(&act);
                 return self.ticket.settle(Err(failure));
             }
         }
-        self.settle(finish(agent, descent));
+        self.settle(finish(agent, act));
     }
 
     fn settle(self, finished: Result<(Episode, Chunk), Failure>) {
@@ -300,20 +303,20 @@ impl<T: Ticket> Rider<T> {
 }
 
 /// One evaluation of a batch. Every evaluation is counted here, and once more where it ends: with an act that was computed, or as waste.
-fn advance(agent: &Agent, descents: &mut [Descent]) -> Result<(), Failure> {
-    guarded(|| agent.advance(descents))?;
+fn advance(agent: &Agent, acts: &mut [Act]) -> Result<(), Failure> {
+    guarded(|| agent.advance(acts))?;
     metrics::counter!("ada_batches_total").increment(1);
-    metrics::histogram!("ada_batch_size").record(descents.len() as f64);
+    metrics::histogram!("ada_batch_size").record(acts.len() as f64);
     Ok(())
 }
 
-fn finish(agent: &Agent, descent: Descent) -> Result<(Episode, Chunk), Failure> {
-    let evaluations = descent.evaluations();
-    guarded(|| agent.finish(descent)).inspect_err(|_| waste(evaluations))
+fn finish(agent: &Agent, act: Act) -> Result<(Episode, Chunk), Failure> {
+    let evaluations = act.evaluations();
+    guarded(|| agent.finish(act)).inspect_err(|_| waste(evaluations))
 }
 
-fn count_waste(descent: &Descent) {
-    waste(descent.evaluations());
+fn count_waste(act: &Act) {
+    waste(act.evaluations());
 }
 
 fn waste(evaluations: u32) {
@@ -383,12 +386,12 @@ mod tests {
                 episode: Arc::new(agent.open(1, &agent.spec().sampler).unwrap()),
                 observation: Observation { state: vec![0.1; 4], ..Observation::default() },
             };
-            let descent = question.begin(&agent).unwrap();
+            let act = question.begin(&agent).unwrap();
             // Twice what it takes, and so half of what it would take at the worker's slowness.
-            let needs = tariff.of(&agent).unwrap().act(descent.evaluations_left(), 1);
+            let needs = tariff.of(&agent).unwrap().act(act.evaluations_left(), 1);
             let now = Instant::now();
             let ticket = Waits(now + 2 * needs + Duration::from_micros(200), told.clone());
-            batch.admit(Job { agent: agent.clone(), question, descent, ticket, submitted: now, turn_by: now, client: 0 }, 1, &tariff);
+            batch.admit(Job { agent: agent.clone(), question, act, ticket, submitted: now, turn_by: now, client: 0 }, 1, &tariff);
             late += outcome.try_iter().filter(|outcome| matches!(outcome, Err(Failure::Late))).count();
             assert!(late < 1000, "it never tries again");
         }
