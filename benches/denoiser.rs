@@ -4,13 +4,15 @@
 
 use ada_diffuser::model::{
     Networks,
-    agent::{Agent, Observation, SamplerOptions},
+    agent::{Agent, Observation},
     config::{ModelConfig, Restart},
-    denoiser::{Condition, DenoiserConfig},
-    diffusion::refine::{LatentRouting, RefineOptions, WindowBatch},
-    latent::{LatentConfig, Tokens},
+    denoiser::Given,
+    diffusion::refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
+    latent::Tokens,
+    method::{Backbone, Future, GruLatent, Looks},
     nn::{Buffer, Params, Value},
     noise::Philox,
+    options::SamplerOptions,
     trajectory::{Layout, TokenRef},
 };
 use criterion::{Criterion, criterion_group, criterion_main};
@@ -20,26 +22,28 @@ const T: usize = 16;
 const STATE: usize = 17;
 const ACTION: usize = 6;
 
-fn config(denoiser: DenoiserConfig) -> ModelConfig {
-    let plain = ModelConfig::plain(Layout { state_dim: STATE, action_dim: ACTION }, Some(LatentConfig { dim: 20, hidden: 64 }), denoiser);
-    let never = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
-    ModelConfig { plan_horizon: T, block_len: 10, level_max: 150, restart: never, ..plain }
+fn config(backbone: Backbone) -> ModelConfig {
+    let latent = GruLatent { dim: 20, hidden: 64, looks: Looks::Block(10), future: Future::Prior };
+    let mut config = ModelConfig::plain(Layout { state_dim: STATE, action_dim: ACTION }, Some(latent), backbone);
+    (config.method.plan.horizon, config.method.plan.level_max) = (T, 150);
+    config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
+    config
 }
 
-fn nets() -> [(&'static str, DenoiserConfig); 3] {
+fn nets() -> [(&'static str, Backbone); 3] {
     [
-        ("unet-narrow", DenoiserConfig::Unet { widths: vec![32, 64, 64, 64] }),
-        ("unet-wide", DenoiserConfig::Unet { widths: vec![32, 64, 128, 256] }),
-        ("dit-48x2", DenoiserConfig::Dit { width: 48, depth: 2, heads: 4 }),
+        ("unet-narrow", Backbone::Unet { widths: vec![32, 64, 64, 64] }),
+        ("unet-wide", Backbone::Unet { widths: vec![32, 64, 128, 256] }),
+        ("dit-48x2", Backbone::Dit { width: 48, depth: 2, heads: 4 }),
     ]
 }
 
 /// The same networks as a server has them: weights constant and packed once.
 fn frozen(config: &ModelConfig) -> Networks {
     let fresh = Params::fresh(0);
-    Networks::new(config, &fresh).expect("sizes fit");
+    Networks::new(config.layout, &config.method, &fresh).expect("sizes fit");
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().copy().expect("copies"))).collect();
-    Networks::new(config, &Params::loaded(tensors)).expect("same names")
+    Networks::new(config.layout, &config.method, &Params::loaded(tensors)).expect("same names")
 }
 
 fn random<V: Value>(shape: [usize; 3]) -> V {
@@ -54,7 +58,7 @@ fn forward(c: &mut Criterion) {
         for batch in [1, 32] {
             let (x, latents): (Buffer, Buffer) = (random([batch, T, STATE + ACTION]), random([batch, T, 20]));
             let levels: Vec<f32> = (0..batch * T).map(|i| (i * 7 % 150) as f32).collect();
-            let condition = Condition { levels: &levels, latents: Some(&latents), observed: None };
+            let condition = Given { levels: &levels, latents: Some(&latents), observed: None };
             c.bench_function(&format!("forward/{name}/batch-{batch}"), |b| {
                 b.iter(|| black_box(networks.denoiser.predict(&x, &condition).expect("predicts")))
             });
@@ -67,7 +71,7 @@ fn act(c: &mut Criterion) {
         let config = config(net);
         let agent = Agent::new(config.clone(), frozen(&config), "bench".into());
         for streaming in [true, false] {
-            let episode = agent.open(1, &SamplerOptions { streaming, ..config.sampler.clone() }).expect("opens");
+            let episode = agent.open(1, &SamplerOptions { streaming, ..config.defaults.sampler.clone() }).expect("opens");
             let observation = Observation { state: vec![0.1; STATE], ..Observation::default() };
             let (episode, _) = agent.act(&episode, &observation).expect("acts");
             let kind = if streaming { "streaming" } else { "cold" };
@@ -81,19 +85,22 @@ fn train_step(c: &mut Criterion) {
     for (name, net) in nets() {
         let config = config(net);
         let params = Params::fresh(0);
-        let networks = Networks::new(&config, &params).expect("sizes fit");
+        let networks = Networks::new(config.layout, &config.method, &params).expect("sizes fit");
         let token = TokenRef { state: Some(&[0.1; STATE]), action: Some(&[0.1; ACTION]), reward: Some(0.1), noise: 0.0 };
         let batch = WindowBatch {
             history: Tokens::pack(config.layout, 0..batch_size, 10, |_, _| token).expect("packs"),
+            history_lens: None,
             window: random([batch_size, T, STATE + ACTION]),
             observed: None,
-            rows: (0..batch_size).map(|i| i % T).collect(),
-            inpaint: vec![true; batch_size],
+            at: (0..batch_size).map(|i| Standing::Row(i % T)).collect(),
+            imagined: vec![0; batch_size],
             noise: random([batch_size, T, STATE + ACTION]),
         };
         let options = RefineOptions { routing: LatentRouting::Matched, first_action_weight: 10.0, sub_steps: 1 };
         c.bench_function(&format!("train-step/{name}/batch-{batch_size}"), |b| {
-            b.iter(|| networks.refine_loss(&config, &batch, &options).expect("computes").loss.backward().expect("differentiates"))
+            b.iter(|| {
+                networks.refine_loss(&config.method.plan, &batch, &options).expect("computes").loss.backward().expect("differentiates")
+            })
         });
     }
 }

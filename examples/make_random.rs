@@ -7,11 +7,11 @@
 mod random_weights;
 
 use ada_diffuser::model::{
-    agent::SamplerOptions,
     checkpoint,
-    config::{ModelConfig, Restart},
-    denoiser::DenoiserConfig,
-    latent::LatentConfig,
+    config::{Defaults, ModelConfig, Restart},
+    method::Backbone,
+    method::{Future, GruLatent, Looks},
+    options::SamplerOptions,
     trajectory::Layout,
 };
 use clap::{Parser, ValueEnum};
@@ -77,21 +77,21 @@ enum Net {
 
 impl Flags {
     fn config(&self) -> ModelConfig {
-        let denoiser = match self.net {
-            Net::Unet => DenoiserConfig::Unet { widths: self.widths.clone() },
-            Net::Dit => DenoiserConfig::Dit { width: self.width, depth: self.depth, heads: self.heads },
+        let backbone = match self.net {
+            Net::Unet => Backbone::Unet { widths: self.widths.clone() },
+            Net::Dit => Backbone::Dit { width: self.width, depth: self.depth, heads: self.heads },
         };
-        let latent = (self.latent_dim > 0).then_some(LatentConfig { dim: self.latent_dim, hidden: self.hidden });
+        let looks = Looks::Block(self.block_len);
+        let latent = (self.latent_dim > 0).then_some(GruLatent { dim: self.latent_dim, hidden: self.hidden, looks, future: Future::Prior });
         let layout = Layout { state_dim: self.state_dim, action_dim: self.action_dim };
-        ModelConfig {
-            plan_horizon: self.plan_horizon,
-            block_len: self.block_len,
-            level_max: self.level_max,
+        let mut config = ModelConfig::plain(layout, latent, backbone);
+        (config.method.plan.horizon, config.method.plan.level_max) = (self.plan_horizon, self.level_max);
+        config.defaults = Defaults {
+            sampler: SamplerOptions { temperature: 0.0, ..SamplerOptions::default() },
             // Finite, since JSON has no infinity, and out of reach.
             restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: 1e30 },
-            sampler: SamplerOptions { temperature: 0.0, ..SamplerOptions::default() },
-            ..ModelConfig::plain(layout, latent, denoiser)
-        }
+        };
+        config
     }
 }
 

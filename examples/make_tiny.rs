@@ -5,16 +5,22 @@
 #[path = "shared/random_weights.rs"]
 mod random_weights;
 
-use ada_diffuser::model::{config::ModelConfig, denoiser::DenoiserConfig, latent::LatentConfig, trajectory::Layout};
+use ada_diffuser::model::{
+    config::ModelConfig,
+    method::{Backbone, Future, GruLatent, Looks},
+    trajectory::Layout,
+};
 use std::path::Path;
 
 const SEED: u64 = 7;
 
 fn main() -> anyhow::Result<()> {
     let layout = Layout { state_dim: 4, action_dim: 2 };
-    let (latent, denoiser) = (LatentConfig { dim: 6, hidden: 32 }, DenoiserConfig::Unet { widths: vec![8, 16, 16] });
-    let plain = ModelConfig::plain(layout, Some(latent), denoiser);
-    let config = ModelConfig { state_clip: 10.0, sub_steps_trained: vec![2, 3, 5], ..plain };
+    let (latent, backbone) =
+        (GruLatent { dim: 6, hidden: 32, looks: Looks::Block(4), future: Future::Prior }, Backbone::Unet { widths: vec![8, 16, 16] });
+    let mut config = ModelConfig::plain(layout, Some(latent), backbone);
+    config.method.plan.clip = 10.0;
+    config.trained.sub_steps = vec![1, 2, 3, 5];
     random_weights::save(Path::new("models/tiny"), &config, SEED)?;
     println!("wrote models/tiny");
     Ok(())

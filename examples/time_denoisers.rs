@@ -7,8 +7,8 @@
 use ada_diffuser::model::{
     Networks,
     config::ModelConfig,
-    denoiser::{Condition, Denoiser, DenoiserConfig},
-    latent::LatentConfig,
+    denoiser::{Denoiser, Given},
+    method::{Backbone, Future, GruLatent, Looks},
     nn::{Activation, Buffer, GroupNormMish, Gru, LayerNorm, Params, Precision, Value, conv1d::ConvLayer},
     noise::Philox,
     trajectory::Layout,
@@ -109,21 +109,23 @@ fn main() -> anyhow::Result<()> {
 }
 
 fn config(flags: &Flags) -> ModelConfig {
-    let denoiser = match flags.net {
-        Net::Unet => DenoiserConfig::Unet { widths: flags.widths.clone() },
-        Net::Dit => DenoiserConfig::Dit { width: flags.width, depth: flags.depth, heads: flags.width / 32 },
+    let backbone = match flags.net {
+        Net::Unet => Backbone::Unet { widths: flags.widths.clone() },
+        Net::Dit => Backbone::Dit { width: flags.width, depth: flags.depth, heads: flags.width / 32 },
     };
-    let plain = ModelConfig::plain(LAYOUT, Some(LatentConfig { dim: LATENT, hidden: 64 }), denoiser);
-    ModelConfig { plan_horizon: flags.len, level_max: LEVELS, ..plain }
+    let latent = GruLatent { dim: LATENT, hidden: 64, looks: Looks::Block(4), future: Future::Prior };
+    let mut config = ModelConfig::plain(LAYOUT, Some(latent), backbone);
+    (config.method.plan.horizon, config.method.plan.level_max) = (flags.len, LEVELS);
+    config
 }
 
 /// The networks as a server has them: weights constant and packed once.
 fn frozen(config: &ModelConfig, weights: Weights) -> anyhow::Result<Networks> {
     let fresh = Params::fresh(0);
-    Networks::new(config, &fresh)?;
+    Networks::new(config.layout, &config.method, &fresh)?;
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
     let precision = if matches!(weights, Weights::Bf16) { Precision::Bf16 } else { Precision::F32 };
-    Ok(Networks::new(config, &Params::loaded_as(tensors, precision))?)
+    Ok(Networks::new(config.layout, &config.method, &Params::loaded_as(tensors, precision))?)
 }
 
 fn forward<V: Value>(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
@@ -149,7 +151,7 @@ fn rounds<V: Value>(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier
     let round = |_| {
         meet.wait();
         let begin = Instant::now();
-        net.predict(&x, &Condition { levels: &levels, latents: Some(&latents), observed: None })?;
+        net.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None })?;
         meet.wait();
         Ok(begin.elapsed().as_secs_f64() * 1e3)
     };
@@ -236,7 +238,7 @@ impl Value for Bare {
 
 fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
     let params = Params::fresh(0);
-    let networks = Networks::new(config, &params)?;
+    let networks = Networks::new(config.layout, &config.method, &params)?;
     let vars = params.vars();
     let mut adam = Adam::new(&vars, |_| 0, 0.0, f64::INFINITY);
     let shards: Vec<(Tensor, Tensor, Tensor)> = (0..flags.threads)
@@ -247,7 +249,7 @@ fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
         .collect::<anyhow::Result<_>>()?;
     let gradient = |(x, latents, target): &(Tensor, Tensor, Tensor)| -> anyhow::Result<GradStore> {
         let levels: Vec<f32> = (0..x.dim(0)? * flags.len).map(|i| (i * 7 % LEVELS) as f32).collect();
-        let y = networks.denoiser.predict(x, &Condition { levels: &levels, latents: Some(latents), observed: None })?;
+        let y = networks.denoiser.predict(x, &Given { levels: &levels, latents: Some(latents), observed: None })?;
         Ok((y - target)?.sqr()?.mean_all()?.affine(1.0 / flags.threads as f64, 0.0)?.backward()?)
     };
     let gradient = &gradient;

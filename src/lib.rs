@@ -11,7 +11,7 @@
 //!
 //! ```text
 //! bin/server -> serve -> model <- train <- bin/trainer        serve and train never meet
-//! model: noise, trajectory <- normalizer <- nn <- {latent | denoiser} <- diffusion <- agent <- checkpoint; check: the one check of a model
+//! model: method, noise, trajectory <- normalizer <- nn <- {latent | denoiser} <- config, columns <- diffusion <- agent <- checkpoint
 //! ```
 //! Only `model` and `train` know candle; only `serve` knows tokio, tonic, axum and the clock; tests in `tests/it` read the source and hold
 //! these borders.
@@ -21,14 +21,17 @@
 //!    says ([`serve::guard`]); [`serve::grpc`] or [`serve::http`] turns them into a request of the core and checks them.
 //! 2. [`serve::session`] compares the step with the committed one: a retry is answered from memory, a wrong step refused; otherwise the
 //!    episode, an immutable value ([`model::agent::Episode`]), is leased.
-//! 3. [`model::agent::Agent::begin`] checks the observation and makes a [`model::agent::Descent`]: a window on its way down the ladder
-//!    ([`model::diffusion::ladder`]).
-//! 4. [`serve::engine`], earliest deadline first, calls [`model::agent::Agent::advance`] on all descents in flight: one forward a tick, on
-//!    pooled memory. A descent that would come too late takes larger jumps. Inside, the latent is inferred
-//!    from what was really seen ([`model::latent`]), refined at rung 1 by the window itself (zig-zag), and the denoiser
-//!    ([`model::denoiser`]) takes every window one row down.
-//! 5. A finished descent is a new episode and a [`model::agent::Chunk`]; the session commits both together, if the step is still the
+//! 3. [`model::agent::Agent::begin`] checks the observation and makes a [`model::agent::Act`]: a small program that asks networks
+//!    ([`model::agent::Ask`]) while its window goes down the table of noise levels ([`model::diffusion::schedule`]).
+//! 4. [`serve::engine`], earliest deadline first, calls [`model::agent::Agent::advance`] on all acts in flight: what they ask is answered
+//!    together, with one forward of the denoiser a tick, on pooled memory. An act that would come too late takes larger jumps. The latent is
+//!    inferred from what was really seen ([`model::latent`], by the same [`model::latent::Evidence`] as in training), refined at rung 1 by the
+//!    window itself (zig-zag), and the denoiser ([`model::denoiser`]) takes every window one row down ([`model::diffusion::descent`]).
+//! 5. A finished act is a new episode and a [`model::agent::Chunk`]; the session commits both together, if the step is still the
 //!    same, and the answer goes out.
+//!
+//! What a model is stands in one struct, [`model::method::Method`], word for word the same in a recipe and in a checkpoint; each choice is a
+//! closed enum. [`model::check`] is the one check of it, for recipes, checkpoints and sessions.
 //!
 //! Networks are written once, over any [`model::nn::Value`]: [`model::nn::Buffer`]s here, candle's tensors in training.
 //!
@@ -44,7 +47,7 @@
 //! | k_i | `level`, `levels` | T_p | `plan_horizon` |
 //! | abar_k | `alpha_bar` | T_a | `action_horizon` |
 //! | eps_theta | [`model::denoiser::Denoiser::predict`] (it predicts x0) | T_x | `block_len` |
-//! | c_t | `latent`, `latents` | x_t | [`model::trajectory::Token`], columns by [`model::trajectory::Layout`] |
+//! | c_t | `latent`, `latents` | x_t | [`model::trajectory::Token`], columns by [`model::columns::Columns`] |
 //! | p_phi, q_psi, p(x given x, c) | [`model::latent::Prior`], [`model::latent::Encoder`], [`model::latent::Decoder`] | zig-zag | `kappa` |
 #![warn(missing_docs)]
 pub mod model;

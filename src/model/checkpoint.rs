@@ -3,6 +3,7 @@
 //! safetensors itself accepts NaN, flipped bits and an 88 MB header, so everything is checked against the manifest, and the networks
 //! must ask for exactly the tensors that are there. What is written is also asked for an act: finite weights can give numbers that are not.
 mod files;
+mod format1;
 
 use crate::model::{
     Networks,
@@ -12,13 +13,14 @@ use crate::model::{
 };
 use candle_core::{Device, Tensor};
 use files::Files;
+use format1::ConfigV1;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::{collections::BTreeMap, path::Path};
 
-/// Version of the three files; a reader refuses others.
-pub const FORMAT_VERSION: u32 = 1;
+/// Version of the three files as they are written. Format 1 is read too; a reader refuses others.
+pub const FORMAT_VERSION: u32 = 2;
 const CONFIG: &str = "config.json";
 const WEIGHTS: &str = "model.safetensors";
 const MANIFEST: &str = "manifest.json";
@@ -82,7 +84,7 @@ pub struct Provenance {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
-    /// [`FORMAT_VERSION`].
+    /// See [`FORMAT_VERSION`].
     pub format_version: u32,
     /// SHA-256 of each file, hex.
     pub files: BTreeMap<String, String>,
@@ -106,10 +108,18 @@ impl Manifest {
     /// The manifest in these bytes, read from `path`.
     fn parse(path: &Path, bytes: &[u8]) -> Result<Self, CheckpointError> {
         let manifest: Self = serde_json::from_slice(bytes).map_err(|error| invalid(path, error.to_string()))?;
-        if manifest.format_version != FORMAT_VERSION {
-            return Err(invalid(path, format!("format version {}, this program reads {FORMAT_VERSION}", manifest.format_version)));
+        if !(1..=FORMAT_VERSION).contains(&manifest.format_version) {
+            return Err(invalid(path, format!("format version {}, this program reads 1 to {FORMAT_VERSION}", manifest.format_version)));
         }
         Ok(manifest)
+    }
+
+    /// The config of these bytes, in today's form whatever the version of the files.
+    fn config(&self, bytes: &[u8]) -> serde_json::Result<ModelConfig> {
+        match self.format_version {
+            1 => serde_json::from_slice::<ConfigV1>(bytes).map(ModelConfig::from),
+            _ => serde_json::from_slice(bytes),
+        }
     }
 
     /// Bytes of a weight file that holds its tensors and nothing else: a larger one is refused before it is read.
@@ -142,8 +152,8 @@ pub fn save(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>
 
 /// Whether an act comes out of it, of the mean state. A loader does not ask: with many levels an act takes long, and who loads acts anyway.
 fn first_act(agent: &Agent) -> Result<(), String> {
-    let mean = Observation { state: agent.config().normalizer.state.mean.clone(), ..Observation::default() };
-    let act = agent.open(0, &agent.config().sampler).and_then(|episode| agent.act(&episode, &mean));
+    let mean = Observation { state: agent.config().units.normalizer.state.mean.clone(), ..Observation::default() };
+    let act = agent.open(0, &agent.config().defaults.sampler).and_then(|episode| agent.act(&episode, &mean));
     act.map(|_| ()).map_err(|error| format!("a first act fails: {error}"))
 }
 
@@ -190,11 +200,11 @@ fn read_files(dir: &Path) -> Result<Files, CheckpointError> {
 fn agent(dir: &Path, files: &Files, precision: Precision) -> Result<Agent, CheckpointError> {
     let (config_path, path) = (dir.join(CONFIG), dir.join(WEIGHTS));
     let manifest = Manifest::parse(&dir.join(MANIFEST), &files.manifest)?;
-    let config: ModelConfig = serde_json::from_slice(&files.config).map_err(|error| invalid(&config_path, error.to_string()))?;
+    let config = manifest.config(&files.config).map_err(|error| invalid(&config_path, error.to_string()))?;
     config.check().map_err(|unfit| invalid(&config_path, unfit.to_string()))?;
     let tensors = read_tensors(&files.weights, &manifest).map_err(|reason| invalid(&path, reason))?;
     let params = Params::loaded_as(tensors, precision);
-    let networks = Networks::new(&config, &params).map_err(|error| invalid(&path, plain(&error)))?;
+    let networks = Networks::new(config.layout, &config.method, &params).map_err(|error| invalid(&path, plain(&error)))?;
     if let Some(name) = params.unused().first() {
         return Err(invalid(&path, format!("tensor {name} belongs to no network of {CONFIG}")));
     }

@@ -89,7 +89,7 @@ fn other_tensors_are_refused() {
 /// Files of `models/tiny` with another temperature and one tensor times `factor`.
 fn other(temperature: f32, factor: f64) -> Files {
     let (mut config, manifest) = (load(&tiny()).unwrap().config().clone(), load_manifest(&tiny()).unwrap().0);
-    config.sampler.temperature = temperature;
+    config.defaults.sampler.temperature = temperature;
     let mut tensors = read_tensors(&fs::read(tiny().join(WEIGHTS)).unwrap(), &manifest).unwrap();
     let name = "denoiser.input_skip.weight";
     tensors.insert(name.into(), tensors[name].affine(factor, 0.0).unwrap());
@@ -138,7 +138,7 @@ fn what_would_not_load_is_not_written() {
     for (factor, words) in [(f64::NAN, "NaN"), (1e38, "act")] {
         let dir = copy();
         let (mut config, manifest) = (load(dir.path()).unwrap().config().clone(), load_manifest(dir.path()).unwrap().0);
-        config.sampler.temperature = 1.0;
+        config.defaults.sampler.temperature = 1.0;
         let mut tensors = read_tensors(&fs::read(dir.path().join(WEIGHTS)).unwrap(), &manifest).unwrap();
         tensors.values_mut().for_each(|tensor| *tensor = tensor.affine(factor, 0.0).unwrap().clamp(-3e38, 3e38).unwrap());
         let error = save(dir.path(), &config, &tensors, &manifest.provenance).unwrap_err().to_string();
@@ -179,34 +179,49 @@ fn a_weight_file_that_is_too_large_is_refused_before_it_is_read() {
 #[test]
 fn other_versions_and_unknown_fields_are_refused() {
     let dir = copy();
-    edit(dir.path(), |manifest, _| manifest["format_version"] = 2.into());
-    assert!(refusal(dir.path()).contains("format version 2"));
+    edit(dir.path(), |manifest, _| manifest["format_version"] = 3.into());
+    assert!(refusal(dir.path()).contains("format version 3"));
     let dir = copy();
     edit(dir.path(), |_, config| config["colour"] = "red".into());
     assert!(refusal(dir.path()).contains("colour"));
     let dir = copy();
-    edit(dir.path(), |_, config| config["normalizer"]["state"]["std"][1] = 0.into());
+    edit(dir.path(), |_, config| config["units"]["normalizer"]["state"]["std"][1] = 0.into());
     assert!(refusal(dir.path()).contains("scale is zero"));
     let dir = copy();
-    edit(dir.path(), |_, config| config["sampler"]["action_horizon"] = 9.into());
+    edit(dir.path(), |_, config| config["defaults"]["sampler"]["action_horizon"] = 9.into());
     assert!(refusal(dir.path()).contains("action_horizon"));
     let dir = copy();
-    edit(dir.path(), |_, config| config["level_max"] = 4.into());
+    edit(dir.path(), |_, config| config["method"]["plan"]["level_max"] = 4.into());
     assert!(refusal(dir.path()).contains("level_max"));
 }
 
 /// A level table of 10^12 entries ended the server by lack of memory, a history of 10^6 steps its acts; now they are refused by name.
 #[test]
 fn absurd_sizes_are_refused_by_name() {
-    for (field, value) in [("level_max", 1_u64 << 40), ("block_len", 1_000_000), ("obs_horizon", 1 << 40), ("plan_horizon", 1 << 20)] {
+    for (field, value) in [("level_max", 1_u64 << 40), ("obs_horizon", 1 << 40), ("horizon", 1 << 20)] {
         let dir = copy();
-        edit(dir.path(), |_, config| config[field] = value.into());
-        assert!(refusal(dir.path()).contains(&format!("{field}: is {value}")), "{}", refusal(dir.path()));
+        edit(dir.path(), |_, config| config["method"]["plan"][field] = value.into());
+        assert!(refusal(dir.path()).contains(&format!("method.plan.{field}: is {value}")), "{}", refusal(dir.path()));
     }
     let dir = copy();
-    edit(dir.path(), |_, config| config["sampler"]["sub_steps"] = ((1_u64 << 61) + 1).into());
+    edit(dir.path(), |_, config| config["method"]["latent"]["looks"]["block"] = 1_000_000.into());
+    assert!(refusal(dir.path()).contains("method.latent.looks: is 1000000"), "{}", refusal(dir.path()));
+    let dir = copy();
+    edit(dir.path(), |_, config| config["defaults"]["sampler"]["sub_steps"] = ((1_u64 << 61) + 1).into());
     assert!(refusal(dir.path()).contains("sampler.sub_steps"));
     let dir = copy();
-    edit(dir.path(), |_, config| config["latent"]["hidden"] = 8000.into());
+    edit(dir.path(), |_, config| config["method"]["latent"]["hidden"] = 8000.into());
     assert!(refusal(dir.path()).contains("parameters"), "{}", refusal(dir.path()));
+}
+
+/// A checkpoint of format 1 is the same model in format 2: `copy_with` writes it anew, and the acts are pinned in `tests/golden/acts.json`.
+#[test]
+fn format_1_is_read_and_written_as_format_2() {
+    let old = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/point-wind-s");
+    assert_eq!(load_manifest(&old).unwrap().0.format_version, 1);
+    let (config, out) = (load(&old).unwrap().config().clone(), tempfile::tempdir().unwrap());
+    copy_with(&old, out.path(), &config).unwrap();
+    assert_eq!(load_manifest(out.path()).unwrap().0.format_version, 2);
+    assert_eq!(*load(out.path()).unwrap().config(), config);
+    assert!(config.method.latent.block_len() == 10 && config.trained.action_horizons == [1, 2, 4] && config.trained.refined);
 }

@@ -2,14 +2,18 @@
 pub mod agent;
 pub mod check;
 pub mod checkpoint;
+pub mod columns;
 pub mod config;
 pub mod denoiser;
 pub mod diffusion;
+pub mod fit;
 pub mod latent;
+pub mod method;
 mod networks;
 pub mod nn;
 pub mod noise;
 pub mod normalizer;
+pub mod options;
 pub mod trajectory;
 
 pub use networks::Networks;

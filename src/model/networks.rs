@@ -1,6 +1,6 @@
 //! The networks of one model under one parameter store.
 
-use crate::model::{config::ModelConfig, denoiser::Denoiser, latent::LatentModel, nn::params::Params};
+use crate::model::{denoiser::Denoiser, latent::LatentModel, method::Method, nn::params::Params, trajectory::Layout};
 use candle_core::Result;
 
 /// Latent model and denoiser; the same value trains (fresh parameters) and serves (loaded ones).
@@ -16,8 +16,9 @@ impl Networks {
     ///
     /// # Errors
     /// If a loaded parameter is missing or of another shape, or sizes do not fit together.
-    pub fn new(config: &ModelConfig, params: &Params) -> Result<Self> {
-        let latent = config.latent.as_ref().map(|latent| LatentModel::new(latent, config.layout, &params.scope("latent")));
-        Ok(Self { latent: latent.transpose()?, denoiser: Denoiser::new(config, &params.scope("denoiser"))? })
+    pub fn new(layout: Layout, method: &Method, params: &Params) -> Result<Self> {
+        let latent = method.latent.gru().map(|latent| LatentModel::new(latent, layout, &params.scope("latent")));
+        let denoiser = Denoiser::new(layout.dim(), method, &params.scope("denoiser"))?;
+        Ok(Self { latent: latent.transpose()?, denoiser })
     }
 }

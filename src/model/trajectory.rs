@@ -51,3 +51,38 @@ impl Token {
         TokenRef { state: self.state.as_deref(), action: self.action.as_deref(), reward: self.reward, noise: self.noise }
     }
 }
+
+/// Which parts of a token are seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Seen {
+    /// s_t.
+    pub state: bool,
+    /// a_t.
+    pub action: bool,
+    /// r_t.
+    pub reward: bool,
+}
+
+impl Seen {
+    /// The whole token.
+    pub const ALL: Self = Self { state: true, action: true, reward: true };
+    /// The state alone: the current time of a decision.
+    pub const STATE: Self = Self { state: true, action: false, reward: false };
+    /// What a window has: rewards are not generated.
+    pub const GENERATED: Self = Self { state: true, action: true, reward: false };
+    /// Nothing of it.
+    pub const NOTHING: Self = Self { state: false, action: false, reward: false };
+
+    /// 1 for each part that is seen, in the order of a token's presence.
+    pub fn flags(self) -> [f32; 3] {
+        [self.state, self.action, self.reward].map(f32::from)
+    }
+}
+
+impl<'a> TokenRef<'a> {
+    /// What is seen of it.
+    pub fn only(self, seen: Seen) -> Self {
+        let Self { state, action, reward, noise } = self;
+        Self { state: state.filter(|_| seen.state), action: action.filter(|_| seen.action), reward: reward.filter(|_| seen.reward), noise }
+    }
+}

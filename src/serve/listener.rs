@@ -2,7 +2,8 @@
 
 use crate::serve::{
     config::{Config, ConnectionConfig},
-    connections::{Activity, Asked, Given, Held, Kind, Place, Places, Verdict, look_interval},
+    connections::{Activity, Asked, Given, Held, Kind, Places, Verdict, look_interval},
+    gate::Gate,
     grpc::{self, endless},
     guard::Guard,
     http::Problem,
@@ -29,7 +30,6 @@ use std::{
     panic::AssertUnwindSafe,
     pin::pin,
     sync::Arc,
-    sync::atomic::{AtomicBool, Ordering},
     time::{Duration, Instant},
 };
 use tokio::{
@@ -37,10 +37,7 @@ use tokio::{
     net::{TcpListener, TcpStream},
     time::{interval, sleep, timeout},
 };
-use tokio_util::{
-    sync::CancellationToken,
-    task::{TaskTracker, task_tracker::TaskTrackerToken},
-};
+use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tower::ServiceExt;
 use tracing::Instrument;
 use uuid::Uuid;
@@ -69,50 +66,6 @@ pub struct Faces {
     pub guard: Guard,
 }
 
-/// A connection's place among the open ones; whatever outlives the connection (a WebSocket) holds it too.
-#[derive(Clone)]
-pub struct Gate {
-    _place: Arc<(Place, TaskTrackerToken)>,
-    client: u64,
-    leave: CancellationToken,
-    hard_end: CancellationToken,
-    marks: Arc<Marks>,
-}
-
-/// What is known of a connection while it goes on.
-#[derive(Default)]
-struct Marks {
-    speaks_http1: AtomicBool,
-    /// Its next answer is its last one (HTTP/1).
-    is_old: AtomicBool,
-    lingers: AtomicBool,
-}
-
-impl Gate {
-    /// Number of the connection.
-    pub fn client(&self) -> u64 {
-        self.client
-    }
-
-    /// The connection will close while its peer is sending: see `serve::wire`.
-    pub fn linger(&self) {
-        self.marks.lingers.store(true, Ordering::Relaxed);
-    }
-
-    /// Whether it will.
-    pub fn lingers(&self) -> bool {
-        self.marks.lingers.load(Ordering::Relaxed)
-    }
-
-    /// Runs it to its end, or to the server's hard end.
-    pub async fn until_hard_end(&self, work: impl Future<Output = ()>) {
-        tokio::select! {
-            () = work => {}
-            () = self.hard_end.cancelled() => {}
-        }
-    }
-}
-
 /// Serves both faces until `leave` is cancelled, then lets every request in flight end, for `server.drain_timeout_ms` at most.
 pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
     let (tracker, hard_end) = (TaskTracker::new(), CancellationToken::new());
@@ -126,9 +79,9 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
             Ok((stream, peer)) => match places.take(peer.ip()) {
                 Some(place) => {
                     let activity = held.begin(place.address(), Instant::now());
-                    let (place, client) = (Arc::new((place, tracker.token())), activity.number);
+                    let (place, client) = ((place, tracker.token()), activity.number);
                     let (leave, hard_end) = (leave.clone(), hard_end.clone());
-                    let gate = Gate { _place: place, client, leave, hard_end, marks: Arc::default() };
+                    let gate = Gate::new(place, client, leave, hard_end);
                     tokio::spawn(connection(stream, faces.clone(), config.clone(), gate, activity));
                 }
                 None => turn_away(stream),
@@ -167,7 +120,7 @@ async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, gate: 
     let patience = Duration::from_millis(config.connection.preface_timeout_ms);
     let greeted = tokio::select! {
         greeted = timeout(patience, has_spoken(&stream)) => greeted,
-        () = gate.leave.cancelled() => Ok(false),
+        () = gate.leave().cancelled() => Ok(false),
     };
     match greeted {
         Ok(true) => gate.until_hard_end(talk(stream, faces, &config, &gate, &activity)).await,
@@ -205,15 +158,15 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate, act
     let ended = loop {
         tokio::select! {
             ended = connection.as_mut() => break ended,
-            () = gate.leave.cancelled(), if !is_leaving => {
+            () = gate.leave().cancelled(), if !is_leaving => {
                 is_leaving = true;
                 connection.as_mut().graceful_shutdown();
             }
             () = of_age.as_mut(), if !is_leaving && !is_old => {
                 is_old = true;
                 // To close between two requests is to cross the next one on its way, which HTTP/1 clients take for a lost answer.
-                if gate.marks.speaks_http1.load(Ordering::Relaxed) {
-                    gate.marks.is_old.store(true, Ordering::Relaxed);
+                if gate.speaks_http1() {
+                    gate.ages();
                 } else {
                     is_leaving = true;
                     connection.as_mut().graceful_shutdown();
@@ -228,7 +181,7 @@ async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate, act
                     connection.as_mut().graceful_shutdown();
                 }
                 // One that was asked and does not go holds its place for nothing.
-                Verdict::Leave if !gate.leave.is_cancelled() => break Ok(()),
+                Verdict::Leave if !gate.leave().is_cancelled() => break Ok(()),
                 Verdict::Cut => {
                     metrics::counter!("ada_connections_timed_out_total").increment(1);
                     break Ok(());
@@ -305,8 +258,8 @@ async fn answer(
     let span = tracing::info_span!("request", %id, face, method = %request.method());
     let is_stream = is_grpc && grpc::is_stream(&path);
     let is_http1 = request.version() < Version::HTTP_2;
-    gate.marks.speaks_http1.store(is_http1, Ordering::Relaxed);
-    let leave = (is_grpc && endless::is_endless(&path)).then(|| gate.leave.clone());
+    gate.speaks(is_http1);
+    let leave = (is_grpc && endless::is_endless(&path)).then(|| gate.leave().clone());
     let kind = match (is_grpc, is_stream) {
         (true, true) => Kind::Messages,
         (true, false) => Kind::Message,
@@ -344,7 +297,7 @@ async fn answer(
     if let Ok(id) = HeaderValue::from_str(&id) {
         response.headers_mut().insert(REQUEST_ID, id);
     }
-    let is_last = gate.marks.is_old.load(Ordering::Relaxed) && response.status() != StatusCode::SWITCHING_PROTOCOLS;
+    let is_last = gate.is_old() && response.status() != StatusCode::SWITCHING_PROTOCOLS;
     if is_http1 && (is_last || gate.lingers() && response.status() == StatusCode::PAYLOAD_TOO_LARGE) {
         response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
     }

@@ -1,7 +1,10 @@
 //! What the faces hand to the service and get back, in the words of the domain.
 
 use crate::{
-    model::agent::{LatentMode, Observation, SamplerOptions},
+    model::{
+        agent::Observation,
+        options::{LatentMode, SamplerOptions},
+    },
     serve::{
         error::ServiceError,
         registry::Model,

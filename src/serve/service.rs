@@ -337,11 +337,11 @@ impl Service {
     /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
     fn submit(&self, seat: Seat, question: Question, turn_by: Instant, client: u64) {
         let agent = seat.session.agent.clone();
-        let descent = match question.begin(&agent) {
-            Ok(descent) => descent,
+        let act = match question.begin(&agent) {
+            Ok(act) => act,
             Err(error) => return seat.session.fail(&seat.flight, ServiceError::from_agent(error)),
         };
-        let job = Job { agent, question, descent, ticket: seat, submitted: Instant::now(), turn_by, client };
+        let job = Job { agent, question, act, ticket: seat, submitted: Instant::now(), turn_by, client };
         let flight = job.ticket.flight.clone();
         let (refusal, job) = match self.engine.submit(job) {
             Ok(waiting) => return flight.waits(|| waiting.leave()),

@@ -4,7 +4,7 @@
 //! large HTTP/2 tells its status and nothing else.) And when it closes while the peer is still sending, the system cuts the connection, and the
 //! peer may lose the answer that says why: so what still comes is read and dropped, for a while.
 
-use crate::serve::{config::Config, error::ServiceError, http::Problem, listener::Gate};
+use crate::serve::{config::Config, error::ServiceError, gate::Gate, http::Problem};
 use axum::{
     body::{Bytes, HttpBody},
     http::StatusCode,

@@ -4,8 +4,8 @@
 //! along the schedule of the new number, so the run is not the one that a fresh start would be, and the checkpoint says so.
 
 use super::{
+    position::{Position, Stage},
     recipe::Recipe,
-    resume::{Position, Stage},
 };
 use serde::{Deserialize, Serialize};
 use std::{

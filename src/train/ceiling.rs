@@ -5,9 +5,10 @@
 
 use super::{
     dataset::{Episode, rows::pieces},
-    probe::{Evidence, Features, Place, Score, Subjects, places, score},
+    probe::{Features, Place, Score, Subjects, places, score},
     ridge::{Ridge, Table},
 };
+use crate::model::latent::Evidence;
 use anyhow::Result;
 use std::io;
 
@@ -121,7 +122,7 @@ mod tests {
         for score in ceiling(&subjects, &[1, 3]).unwrap() {
             match score.evidence {
                 Evidence::Filter => assert!(score.error > 0.9, "{score:?}"),
-                Evidence::SuccessorState | Evidence::Successor => assert!(score.error < 0.01, "{score:?}"),
+                Evidence::Refinement | Evidence::SuccessorState | Evidence::Successor => assert!(score.error < 0.01, "{score:?}"),
             }
         }
     }

@@ -125,5 +125,5 @@ fn bad_defaults_leave_the_checkpoint_as_it_was() {
         assert!(files.iter().all(|name| same(name)), "{text}");
     }
     set("restart.latent_jump=inf").unwrap();
-    assert!(checkpoint::load(dir.path()).unwrap().config().restart.latent_jump.is_infinite());
+    assert!(checkpoint::load(dir.path()).unwrap().config().defaults.restart.latent_jump.is_infinite());
 }

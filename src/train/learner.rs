@@ -3,8 +3,8 @@
 use super::{
     Task,
     optimizer::{Adam, Ema},
-    resume::{Notes, Position, Snapshot, Stage, State, restore_vars},
-    stage1::attempt_seed,
+    position::{Position, Stage},
+    resume::{Notes, Snapshot, State, restore_vars},
 };
 use crate::model::{Networks, nn::params::Params};
 use anyhow::Result;
@@ -41,8 +41,8 @@ impl Learner {
     /// # Errors
     /// If the networks cannot be built from the recipe.
     pub fn fresh(task: &Task, attempt: usize) -> Result<Self> {
-        let params = Params::fresh(attempt_seed(&task.recipe, attempt));
-        let networks = Networks::new(&task.config, &params)?;
+        let params = Params::fresh(task.recipe.seed_of(attempt));
+        let networks = Networks::new(task.config.layout, &task.config.method, &params)?;
         let vars = params.vars();
         let stage = if task.recipe.stage1.is_some() { Stage::Latent } else { Stage::Refine };
         let (adam, ema) = equip(task, stage, &vars)?;
@@ -90,7 +90,7 @@ impl Learner {
             Some(ema) => ema.tensors(&self.vars)?,
             None => self.vars.iter().map(|(name, var)| (name.clone(), var.as_tensor().clone())).collect(),
         };
-        Ok((Networks::new(&task.config, &Params::loaded(tensors.clone()))?, tensors))
+        Ok((Networks::new(task.config.layout, &task.config.method, &Params::loaded(tensors.clone()))?, tensors))
     }
 }
 

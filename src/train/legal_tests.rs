@@ -4,7 +4,6 @@ use super::{Task, dataset::room::Room, recipe::Recipe, tests::recipe_with};
 use crate::model::{
     Networks,
     checkpoint::{Provenance, load, save},
-    config::ModelConfig,
     nn::params::Params,
 };
 use proptest::{prelude::*, sample::select};
@@ -14,16 +13,16 @@ const KEYS: [&str; 47] = [
     "seed",
     "checkpoint_every",
     "log_every",
-    "model.plan_horizon",
-    "model.block_len",
-    "model.obs_horizon",
-    "model.level_max",
-    "model.state_clip",
+    "model.plan.horizon",
+    "model.latent.looks.block",
+    "model.plan.obs_horizon",
+    "model.plan.level_max",
+    "model.plan.clip",
     "model.latent.dim",
     "model.latent.hidden",
-    "model.denoiser.width",
-    "model.denoiser.depth",
-    "model.denoiser.heads",
+    "model.plan.backbone.width",
+    "model.plan.backbone.depth",
+    "model.plan.backbone.heads",
     "stage1.steps",
     "stage1.batch",
     "stage1.length",
@@ -112,9 +111,9 @@ fn ships(recipe: &Recipe) -> Result<(), String> {
     // Refused with the units of the data, or because the data set is too short for it: that is before training as well.
     let Ok(task) = Task::new(recipe.clone(), &Room::default()) else { return Ok(()) };
     let params = Params::fresh(recipe.seed);
-    Networks::new(&task.config, &params).map_err(|error| error.to_string())?;
+    Networks::new(task.config.layout, &task.config.method, &params).map_err(|error| error.to_string())?;
     let tensors = params.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
-    let config = ModelConfig { latent_spread: 1.0, ..task.config };
+    let config = task.config;
     let dir = tempfile::tempdir().map_err(|error| error.to_string())?;
     let provenance = Provenance { recipe: recipe.to_toml(), ..Provenance::default() };
     save(dir.path(), &config, &tensors, &provenance).map_err(|error| error.to_string())?;
@@ -130,14 +129,14 @@ fn check(changes: &[String]) -> Result<(), String> {
 /// A recipe with a negative or infinite `restart`, or an infinite `state_clip`, trained to the end into a checkpoint that was refused.
 #[test]
 fn what_was_legal_and_did_not_load() {
-    for change in ["restart.latent_jump=-1.0", "restart.cold_distance=inf", "restart.renoise_distance=nan", "model.state_clip=inf"] {
+    for change in ["restart.latent_jump=-1.0", "restart.cold_distance=inf", "restart.renoise_distance=nan", "model.plan.clip=inf"] {
         check(&[change.to_string()]).unwrap_or_else(|error| panic!("{change}: {error}"));
     }
     let refused = |change: &str| {
         recipe_with(&["restart={renoise_distance=1, cold_distance=1, latent_jump=1}", change]).err().map(|error| error.to_string())
     };
     assert!(refused("restart.latent_jump=-1.0").unwrap().contains("`restart.latent_jump`: is -1"));
-    assert!(refused("model.state_clip=inf").unwrap().contains("`model.state_clip`: is inf"));
+    assert!(refused("model.plan.clip=inf").unwrap().contains("`model.plan.clip`: is inf"));
     assert_eq!(refused("restart.latent_jump=inf"), None, "never");
     assert!(Path::new("tests/golden/data_good.h5").exists(), "the data set is there, so these were not refused for want of it");
 }
@@ -150,8 +149,8 @@ proptest! {
         widths in prop::option::of(select(&WIDTHS[..])),
         list in prop::option::of(select(&LISTS[..])),
     ) {
-        let dit = "model.denoiser={kind = \"dit\", width = 8, depth = 1, heads = 2}".to_string();
-        let denoiser = widths.map_or(dit, |widths| format!("model.denoiser={{kind = \"unet\", widths = {widths}}}"));
+        let dit = "model.plan.backbone={kind = \"dit\", width = 8, depth = 1, heads = 2}".to_string();
+        let denoiser = widths.map_or(dit, |widths| format!("model.plan.backbone={{kind = \"unet\", widths = {widths}}}"));
         let changes: Vec<String> = std::iter::once(denoiser).chain(changes.iter().map(|(key, value)| format!("{key}={value}")))
             .chain(list.map(String::from)).collect();
         prop_assert_eq!(check(&changes), Ok(()), "{:?}", changes);
@@ -164,17 +163,18 @@ proptest! {
 #[test]
 fn shipped_recipes_are_right_and_hold_every_key() {
     let mut count = 0;
-    for entry in fs::read_dir("models").unwrap() {
-        for path in ["recipe.toml", "without-latents.toml"].map(|file| entry.as_ref().unwrap().path().join(file)) {
-            let Ok(text) = fs::read_to_string(&path) else { continue };
-            let recipe = Recipe::read(&path, &[], None).unwrap_or_else(|error| panic!("{error}"));
-            assert!(recipe.model.latent.is_some() || !recipe.sampler.streaming, "{}: nothing tells when a window is stale", path.display());
-            let (written, known) = (toml::from_str(&text).unwrap(), toml::from_str(&recipe.to_toml()).unwrap());
-            assert_eq!(keys(&written), keys(&known), "{}: a key without a line", path.display());
-            count += 1;
-        }
+    let models = fs::read_dir("models").unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.is_dir());
+    let files = models.flat_map(|model| fs::read_dir(model).unwrap().map(|entry| entry.unwrap().path()));
+    for path in files.filter(|path| path.extension().is_some_and(|extension| extension == "toml")) {
+        let text = fs::read_to_string(&path).unwrap();
+        let recipe = Recipe::read(&path, &[], None).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        let tells = recipe.model.latent.gru().is_some();
+        assert!(tells || !recipe.sampler.streaming, "{}: nothing tells when a window is stale", path.display());
+        let (written, known) = (toml::from_str(&text).unwrap(), toml::from_str(&recipe.to_toml()).unwrap());
+        assert_eq!(keys(&written), keys(&known), "{}: a key without a line", path.display());
+        count += 1;
     }
-    assert!(count >= 6);
+    assert!(count >= 9);
 }
 
 /// Dotted names of all values of a table.

@@ -4,7 +4,7 @@
 //! a restart, and drop every curve from there on.
 
 use super::{
-    resume::{Position, Stage},
+    position::{Position, Stage},
     tensorboard::EventWriter,
 };
 use anyhow::{Context, Result};

@@ -13,11 +13,14 @@ mod legal_tests;
 pub mod log;
 pub mod optimizer;
 pub mod parallel;
+pub mod position;
 pub mod probe;
 pub mod recipe;
 pub mod report;
 pub mod resume;
 pub mod ridge;
+#[cfg(test)]
+mod same_tests;
 mod ship;
 pub mod stage1;
 pub mod stage2;
@@ -25,7 +28,7 @@ pub mod tensorboard;
 #[cfg(test)]
 mod tests;
 
-use crate::model::{checkpoint::is_name, config::ModelConfig};
+use crate::model::{checkpoint::is_name, config::ModelConfig, method::Looks};
 use anyhow::{Context, Result, bail, ensure};
 use dataset::{
     Split, UnitsFrom, hdf5,
@@ -34,8 +37,9 @@ use dataset::{
 };
 use learner::{Learner, Scalars};
 use log::{Clock, Log};
+use position::Stage;
 use recipe::{Gate, Recipe};
-use resume::{Stage, Store};
+use resume::Store;
 use ship::Product;
 use stage1::ElboTask;
 use stage2::RefineTask;
@@ -106,12 +110,7 @@ impl Task {
         }
         let (layout, notes, dataset_digest) = (dataset.layout(), std::mem::take(&mut dataset.notes), dataset.digest.clone());
         let (split, action_columns) = dataset.split(UnitsFrom::Data(&recipe.actions))?;
-        let config = ModelConfig {
-            action_low: split.units.action_low.clone(),
-            action_high: split.units.action_high.clone(),
-            normalizer: split.units.normalizer.clone(),
-            ..recipe.config(layout)
-        };
+        let config = ModelConfig { units: split.units.clone(), ..recipe.config(layout) };
         // The recipe was checked with plain units; now the data's are known.
         config.check().with_context(|| format!("data set {} makes no model", recipe.data.display()))?;
         let task = Self { recipe, split, action_columns, dataset_digest, config, notes };
@@ -124,6 +123,11 @@ impl Task {
             );
         }
         Ok(task)
+    }
+
+    /// How far the encoder looks back; a model without one has no block.
+    pub fn looks(&self) -> Looks {
+        self.config.method.latent.gru().map_or(Looks::Block(0), |gru| gru.looks)
     }
 }
 
@@ -255,7 +259,9 @@ impl Crank<'_> {
         let task = self.task;
         let Some(latent) = learner.networks.latent.as_ref().filter(|_| task.split.train[0].context_dim > 0) else { return Ok(true) };
         let result = stage1::gate(task, latent)?;
-        self.log.write(&learner.position, &[("probe_filter", result.filter), ("probe_successor_state", result.successor_state)])?;
+        let successor_state = result.successor_state.map(|error| ("probe_successor_state", error));
+        let probed: Vec<_> = [("probe_filter", result.filter)].into_iter().chain(successor_state).collect();
+        self.log.write(&learner.position, &probed)?;
         learner.notes.probes.push(serde_json::to_value(result)?);
         let Some(gate) = &task.recipe.gate else { return Ok(true) };
         if !result.passes(gate) && learner.position.attempt + 1 >= gate.tries {

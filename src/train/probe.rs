@@ -3,11 +3,15 @@
 use super::{
     dataset::{
         Episode,
-        window::{Seen, TokenRows},
+        window::{TokenRows, histories},
     },
     ridge::{Ridge, Table, standardised_error},
 };
-use crate::model::latent::LatentModel;
+use crate::model::{
+    latent::{Evidence, LatentModel},
+    method::Looks,
+    trajectory::Seen,
+};
 use anyhow::{Result, ensure};
 use serde::Serialize;
 use std::io;
@@ -17,21 +21,12 @@ const CHUNK: usize = 512;
 /// Penalty of the probe; its few latents do not need more than numerical safety.
 const LAMBDA: f64 = 1e-6;
 
-/// What the latent of c_t is inferred from, beside `block_len` whole tokens before t.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Evidence {
-    /// s_t, then the prior: what a decision at t has ("without the future token").
-    Filter,
-    /// x_t and the successor state s_{t+1}.
-    SuccessorState,
-    /// x_t and the whole successor token x_{t+1}.
-    Successor,
-}
+/// The evidence that a probe looks at, least first.
+const PROBED: [Evidence; 3] = [Evidence::Filter, Evidence::SuccessorState, Evidence::Successor];
 
-impl Evidence {
-    /// All of them, least first.
-    pub const ALL: [Self; 3] = [Self::Filter, Self::SuccessorState, Self::Successor];
+/// Those that it looks at in this model: a belief that is held does not wait for a successor.
+pub fn probed(latent: &LatentModel) -> &'static [Evidence] {
+    if latent.prior.is_some() { &PROBED } else { &PROBED[..1] }
 }
 
 /// Where features were taken: (episode, t).
@@ -49,24 +44,18 @@ pub fn places(episodes: &[Episode], rows_max: usize) -> Vec<Place> {
 ///
 /// # Errors
 /// If a tensor operation fails.
-pub fn latent_means(latent: &LatentModel, episodes: &[Episode], places: &[Place], evidence: Evidence, block_len: usize) -> Result<Table> {
+pub fn latent_means(latent: &LatentModel, episodes: &[Episode], places: &[Place], evidence: Evidence, looks: Looks) -> Result<Table> {
     let mut out = Table::new(0);
     for chunk in places.chunks(CHUNK) {
-        let Some(first) = chunk.first() else { break };
-        let mut rows = TokenRows::new(episodes[first.0].layout);
-        for (episode, t) in chunk {
-            let (episode, t) = (&episodes[*episode], *t as isize);
-            (t - block_len as isize..t).try_for_each(|past| rows.push(episode, past, Seen::ALL))?;
-            if evidence == Evidence::Filter {
-                rows.push(episode, t, Seen::STATE)?;
-            } else {
-                rows.push(episode, t, Seen::ALL)?;
-                rows.push(episode, t + 1, if evidence == Evidence::Successor { Seen::ALL } else { Seen::STATE })?;
-            }
+        let pasts: Vec<_> = chunk.iter().map(|(episode, t)| (&episodes[*episode], *t as isize)).collect();
+        let (history, lens) = histories(&pasts, looks, |_, _| Seen::ALL)?;
+        let mut ahead = TokenRows::new(pasts[0].0.layout);
+        for (episode, t) in &pasts {
+            evidence.ahead().iter().zip(*t..).try_for_each(|(seen, at)| ahead.push(episode, at, *seen))?;
         }
-        let len = block_len + if evidence == Evidence::Filter { 1 } else { 2 };
-        let posterior = latent.infer(&rows.tokens(len)?)?;
-        let gaussian = if evidence == Evidence::Filter { latent.prior.predict(&posterior)? } else { posterior };
+        let ahead = ahead.tokens(pasts.len(), evidence.ahead().len())?;
+        let posterior = latent.infer_behind(&history, lens.as_deref(), &ahead)?;
+        let gaussian = if evidence == Evidence::Filter { latent.coming(posterior)? } else { posterior };
         out.width = gaussian.mean.dim(candle_core::D::Minus1)?;
         out.values.extend(gaussian.mean.flatten_all()?.to_vec1::<f32>()?.into_iter().map(f64::from));
     }
@@ -91,7 +80,7 @@ pub struct Score {
     pub source: &'static str,
     /// What it saw.
     pub evidence: Evidence,
-    /// Whole tokens before t.
+    /// Whole tokens before t; 0: all of the episode's.
     pub block_len: usize,
     /// The estimate at t is held against `context[t + shift]`.
     pub shift: i32,
@@ -154,19 +143,20 @@ pub struct Subjects<'a> {
     pub rows_max: usize,
 }
 
-/// The linear probe of a latent model at one block length and evidence, over shifts.
+/// The linear probe of a latent model that looks back so far, with this evidence, over shifts.
 ///
 /// # Errors
 /// If the data have no context, or a tensor operation fails.
-pub fn latent_probe(latent: &LatentModel, subjects: &Subjects, evidence: Evidence, block_len: usize, shifts: &[i32]) -> Result<Vec<Score>> {
+pub fn latent_probe(latent: &LatentModel, subjects: &Subjects, evidence: Evidence, looks: Looks, shifts: &[i32]) -> Result<Vec<Score>> {
     let context_dim = subjects.train.first().map_or(0, |episode| episode.context_dim);
     ensure!(context_dim > 0, "the data set has no `infos/context`, so there is no truth to probe for");
     let features = |episodes| -> Result<Features> {
         let places = places(episodes, subjects.rows_max);
-        let table = latent_means(latent, episodes, &places, evidence, block_len)?;
+        let table = latent_means(latent, episodes, &places, evidence, looks)?;
         Ok(Features { episodes, places, table })
     };
     let (fit, test) = (features(subjects.train)?, features(subjects.held_out)?);
+    let block_len = looks.block_len();
     let line = |shift: &i32| {
         let (error, error_all) = score(&fit, &test, *shift, block_len, LAMBDA)?;
         Ok(Score { source: "latent", evidence, block_len, shift: *shift, error, r2: 1.0 - error, error_all })

@@ -5,12 +5,11 @@ use super::{
     optimizer::LearningRate,
 };
 use crate::model::{
-    agent::SamplerOptions,
     checkpoint::{NAME_LEN_MAX, is_name},
-    config::{ModelConfig, Restart},
-    denoiser::DenoiserConfig,
+    config::{Defaults, ModelConfig, Restart, Trained, Units},
     diffusion::refine::LatentRouting,
-    latent::LatentConfig,
+    method::{Future, Method, Schedule},
+    options::SamplerOptions,
     trajectory::Layout,
 };
 use serde::{Deserialize, Serialize};
@@ -82,8 +81,8 @@ pub struct Recipe {
     /// What is hidden of histories, so that acts may come without it.
     #[serde(default)]
     pub hide: Hide,
-    /// What is built.
-    pub model: Model,
+    /// What is built, and how it acts.
+    pub model: Method,
     /// Latent identification; absent for models without latents.
     pub stage1: Option<Stage1>,
     /// What stage 1 must reach.
@@ -95,26 +94,6 @@ pub struct Recipe {
     /// When a streaming window is not trusted any more; goes into the checkpoint.
     #[serde(default)]
     pub restart: Restart,
-}
-
-/// Architecture; the fields are those of [`crate::model::config::ModelConfig`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Model {
-    /// Generated positions of the window (T).
-    pub plan_horizon: usize,
-    /// Real tokens the latent looks back on (T_x).
-    pub block_len: usize,
-    /// Real steps the denoiser itself sees (T_o); 1 is the current state alone.
-    pub obs_horizon: usize,
-    /// Number of diffusion levels (K).
-    pub level_max: usize,
-    /// Bound of denoised states, in standard deviations of the data.
-    pub state_clip: f32,
-    /// The latent; absent for the plain diffusion baselines.
-    pub latent: Option<LatentConfig>,
-    /// The denoiser.
-    pub denoiser: DenoiserConfig,
 }
 
 /// Latent identification by the ELBO (section 4.2 of the paper).
@@ -190,6 +169,9 @@ pub struct Stage2 {
     pub elbo_weight: f64,
     /// Where the latents of a window come from.
     pub routing: LatentRouting,
+    /// Which levels windows are shown at.
+    #[serde(default)]
+    pub levels: TrainingLevels,
     /// Weight of the first action against one other entry of the window.
     pub first_action_weight: f32,
     /// Chunk lengths that a session may ask for (T_a), beside `sampler.action_horizon`.
@@ -200,6 +182,20 @@ pub struct Stage2 {
     /// Largest decay of the EMA.
     pub ema_decay_max: f64,
 }
+
+/// Levels of a training window.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TrainingLevels {
+    /// Those of the rows that the sampler walks.
+    #[default]
+    Schedule,
+    /// Of each position one of its own (diffusion forcing): every number of sub-steps is then trained, and no refinement.
+    Independent,
+}
+
+/// Sub-steps per rung that a checkpoint lists as trained where every level is.
+const SUB_STEPS_LISTED: usize = 64;
 
 impl Recipe {
     /// Reads a recipe, applies overrides (`stage2.steps=100`) and the path of another data set, and checks it.
@@ -225,6 +221,11 @@ impl Recipe {
         }
         recipe.check()?;
         Ok(recipe)
+    }
+
+    /// Seed of the weights of one attempt at stage 1.
+    pub fn seed_of(&self, attempt: usize) -> u64 {
+        self.seed + 1000 * attempt as u64
     }
 
     /// The recipe as TOML, as it goes into the manifest: overrides included, of the data set's path only the name (where it is not Unicode,
@@ -255,26 +256,38 @@ impl Recipe {
 
     /// What this recipe ships, with plain units in place of what only data and training tell.
     pub fn config(&self, layout: Layout) -> ModelConfig {
-        let model = &self.model;
         ModelConfig {
-            plan_horizon: model.plan_horizon,
-            block_len: model.block_len,
-            obs_horizon: model.obs_horizon,
-            level_max: model.level_max,
-            state_clip: model.state_clip,
-            sub_steps_trained: vec![self.sampler.sub_steps],
-            action_horizons_trained: self.action_horizons(),
-            missing_trained: self.hide.trained(),
-            refined: model.latent.is_some() && self.stage2.routing == LatentRouting::Matched,
-            restart: self.restart,
-            sampler: self.sampler.clone(),
-            ..ModelConfig::plain(layout, model.latent.clone(), model.denoiser.clone())
+            layout,
+            method: self.model.clone(),
+            units: Units::plain(layout),
+            trained: Trained {
+                action_horizons: self.action_horizons(),
+                sub_steps: self.sub_steps(),
+                missing: self.hide.trained(),
+                refined: self.refines(),
+            },
+            defaults: Defaults { sampler: self.sampler.clone(), restart: self.restart },
         }
+    }
+
+    /// Sub-steps whose levels are trained, ascending.
+    fn sub_steps(&self) -> Vec<usize> {
+        let most = self.model.plan.level_max / self.model.plan.horizon.max(1);
+        match (self.stage2.levels, self.model.plan.schedule) {
+            (TrainingLevels::Independent, Schedule::Ladder) => (1..=most.min(SUB_STEPS_LISTED)).collect(),
+            (TrainingLevels::Independent, Schedule::Uniform { .. }) | (TrainingLevels::Schedule, _) => vec![self.sampler.sub_steps],
+        }
+    }
+
+    /// Whether latents are refined in training as zig-zag does it.
+    fn refines(&self) -> bool {
+        let Stage2 { routing, levels, .. } = &self.stage2;
+        self.model.can_refine() && *routing == LatentRouting::Matched && *levels == TrainingLevels::Schedule
     }
 
     /// Steps an episode must have, and the keys that ask for them.
     pub fn episode_len_min(&self) -> (usize, String) {
-        let window = (self.model.plan_horizon, "`model.plan_horizon`".to_string());
+        let window = (self.model.plan.horizon, "`model.plan.horizon`".to_string());
         let block = self.stage1.as_ref().map(|stage| (stage.length + 1, "`stage1.length` + 1".to_string()));
         block.into_iter().fold(window, |most, other| if other.0 > most.0 { other } else { most })
     }
@@ -282,13 +295,18 @@ impl Recipe {
     /// What is shipped must be a model that loads ([`ModelConfig::check`]); the rest is training's own.
     fn check(&self) -> Result<(), RecipeError> {
         self.config(Layout { state_dim: 1, action_dim: 1 }).check().map_err(|unfit| {
-            let own = unfit.field.starts_with("sampler.") || unfit.field.starts_with("restart.");
-            RecipeError::Invalid { key: if own { unfit.field } else { format!("model.{}", unfit.field) }, reason: unfit.reason }
+            // The recipe's own sections for the same things.
+            let key = match unfit.field.split_once('.') {
+                Some(("defaults", field)) => field.into(),
+                Some(("method", field)) => format!("model.{field}"),
+                _ => unfit.field,
+            };
+            RecipeError::Invalid { key, reason: unfit.reason }
         })?;
         let room = NAME_LEN_MAX.saturating_sub(format!("-seed{}", self.seed).len());
         let named = is_name(&self.name) && self.name.len() <= room;
         require(named, "name", format!("{:?} must be 1 to {room} of A-Z a-z 0-9 _ . -, as the server serves it by this name", self.name))?;
-        require(self.model.plan_horizon >= 2, "model.plan_horizon", "must be at least 2")?;
+        require(self.model.plan.horizon >= 2, "model.plan.horizon", "must be at least 2")?;
         for (key, value) in [("checkpoint_every", self.checkpoint_every), ("log_every", self.log_every)] {
             require(value >= 1, key, "must be at least 1")?;
         }
@@ -303,7 +321,7 @@ impl Recipe {
     }
 
     fn check_stage1(&self) -> Result<(), RecipeError> {
-        let stage = match (&self.model.latent, &self.stage1) {
+        let stage = match (self.model.latent.gru(), &self.stage1) {
             (Some(_), Some(stage)) => stage,
             (None, None) => return require(self.gate.is_none(), "gate", "needs model.latent"),
             (Some(_), None) => return require(false, "stage1", "is missing, but model.latent asks for it"),
@@ -336,10 +354,22 @@ impl Recipe {
         require(stage.elbo_weight == 0.0 || self.stage1.is_some(), "stage2.elbo_weight", "must be 0 without stage1")?;
         between("stage2.latent_lr_factor", stage.latent_lr_factor, WEIGHTS)?;
         between("stage2.weight_decay", stage.weight_decay, WEIGHTS)?;
-        let within = stage.action_horizons.iter().all(|horizon| (1..=self.model.plan_horizon).contains(horizon));
-        require(within, "stage2.action_horizons", format!("must lie in 1..={} (model.plan_horizon)", self.model.plan_horizon))?;
+        let within = stage.action_horizons.iter().all(|horizon| (1..=self.model.plan.horizon).contains(horizon));
+        require(within, "stage2.action_horizons", format!("must lie in 1..={} (model.plan.horizon)", self.model.plan.horizon))?;
         let gaps = self.action_horizons().iter().all(|horizon| *horizon == 1) || self.hide.state > 0.0;
         require(gaps, "hide.state", "must be above 0 where a chunk has several actions: its client may know no states in between")?;
+        let alone = self.action_horizons() == [1] || self.refines() || self.model.latent.gru().is_none();
+        let walks = self.model.plan.schedule == Schedule::Ladder;
+        let reason = "must be 1 alone, as `sampler.action_horizon`: without refinement the latent of a chunk's later actions would be that of its \
+                      first, which no window of training has";
+        require(alone || !walks, "stage2.action_horizons", reason)?;
+        let held = self.model.latent.gru().is_some_and(|gru| gru.future == Future::Held);
+        let literal = stage.routing == LatentRouting::Literal;
+        require(
+            !(held && literal),
+            "stage2.routing",
+            "cannot be literal where model.latent.future is held: a held belief has no posterior",
+        )?;
         check_rate("stage2.learning_rate", &stage.learning_rate)
     }
 }

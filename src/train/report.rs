@@ -3,16 +3,18 @@
 use super::{
     ceiling::ceiling,
     dataset::{UnitsFrom, hdf5, room::Room},
-    probe::{Evidence, Score, Subjects, latent_probe},
+    probe::{Score, Subjects, latent_probe, probed},
 };
-use crate::model::{checkpoint, nn::plain};
+use crate::model::{checkpoint, method::Looks, nn::plain};
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
-use std::path::Path;
+use std::{collections::BTreeSet, path::Path};
 
 /// Places of each side that the probe uses.
 const ROWS: usize = 20_000;
 const SHIFTS: [i32; 3] = [-1, 0, 1];
+/// Block lengths of the ceiling beside a GRU that runs on.
+const CEILINGS: [usize; 3] = [1, 4, 10];
 
 /// Probes a checkpoint against a data set: block lengths 1, 2, 4 and T_x, every evidence, shifts -1, 0, 1, and the ceiling; and what a
 /// person should know about the data.
@@ -34,22 +36,31 @@ pub fn probe(dir: &Path, data: &Path, room: &Room) -> Result<(Vec<Score>, Vec<St
         config.layout.state_dim,
         config.layout.action_dim
     );
-    dataset.leave_out_shorter(config.block_len + 2, "the block length + 2")?;
+    dataset.leave_out_shorter(config.method.latent.block_len() + 2, "the block length + 2")?;
     let notes = std::mem::take(&mut dataset.notes);
-    let (split, _) = dataset.split(UnitsFrom::Checkpoint(config))?;
+    let (split, _) = dataset.split(UnitsFrom::Checkpoint(&config.units))?;
     let subjects = Subjects { train: &split.train, held_out: &split.held_out, rows_max: ROWS };
-    let mut block_lens = vec![1, 2, 4, config.block_len];
-    block_lens.retain(|len| *len <= config.block_len);
-    block_lens.sort_unstable();
-    block_lens.dedup();
+    let looks = config.method.latent.gru().map_or(Looks::Block(0), |gru| gru.looks);
     let mut scores = Vec::new();
-    for block_len in &block_lens {
-        for evidence in Evidence::ALL {
-            scores.extend(latent_probe(latent, &subjects, evidence, *block_len, &SHIFTS)?);
+    for looks in shorter(looks) {
+        for evidence in probed(latent) {
+            scores.extend(latent_probe(latent, &subjects, *evidence, looks, &SHIFTS)?);
         }
     }
-    scores.extend(ceiling(&subjects, &block_lens)?);
+    let block_lens: Vec<usize> = shorter(looks).into_iter().map(Looks::block_len).collect();
+    scores.extend(ceiling(&subjects, if looks == Looks::Running { &CEILINGS } else { &block_lens })?);
     Ok((scores, notes))
+}
+
+/// Block lengths up to the model's own; a GRU that runs on has none to choose.
+fn shorter(looks: Looks) -> Vec<Looks> {
+    match looks {
+        Looks::Block(own) => {
+            let lens: BTreeSet<usize> = [1, 2, 4, own].into_iter().filter(|len| *len <= own).collect();
+            lens.into_iter().map(Looks::Block).collect()
+        }
+        Looks::Running => vec![Looks::Running],
+    }
 }
 
 /// The probe as a table for people.
@@ -84,24 +95,20 @@ pub fn inspect(dir: &Path) -> Result<Value> {
         "parameters": {"latent": parameters("latent."), "denoiser": parameters("denoiser.")},
         // By way of text, where a number of 32 bits has the digits that a person gave it.
         "config": serde_json::from_str::<Value>(&serde_json::to_string(agent.config())?)?,
-        "trained": agent.config().trained(),
         "provenance": manifest.provenance,
     }))
 }
 
-/// Fields of the configuration that stand in front, are told in other words, or are too long to tell.
-const NOT_LISTED: [&str; 7] =
-    ["sampler", "restart", "refined", "sub_steps_trained", "action_horizons_trained", "missing_trained", "normalizer"];
-
 /// [`inspect`] for people: first what is in force when the checkpoint is served, last the recipe that it was trained with.
 pub fn inspect_text(value: &Value) -> String {
     let (config, provenance) = (&value["config"], &value["provenance"]);
+    let (method, units, defaults) = (&config["method"], &config["units"], &config["defaults"]);
     let pair = |name: &str, value: &Value| format!("{name:<11} {}\n", told(value));
-    let mut text = pair("digest", &value["digest"]) + &pair("sampler", &config["sampler"]) + &pair("restart", &config["restart"]);
-    text += &pair("trained for", &trained(value));
-    for (key, value) in config.as_object().into_iter().flatten().filter(|(key, _)| !NOT_LISTED.contains(&key.as_str())) {
-        text += &if key == "latent" && value.is_null() { pair(key, &"none".into()) } else { pair(key, value) };
-    }
+    let mut text = pair("digest", &value["digest"]) + &pair("sampler", &defaults["sampler"]) + &pair("restart", &defaults["restart"]);
+    text += &pair("trained for", &trained(&config["trained"]));
+    text += &(pair("layout", &config["layout"]) + &pair("latent", &method["latent"]));
+    method["plan"].as_object().into_iter().flatten().for_each(|(key, value)| text += &pair(key, value));
+    ["action_low", "action_high", "latent_spread"].into_iter().for_each(|key| text += &pair(key, &units[key]));
     text += &pair("parameters", &value["parameters"]);
     for key in ["dataset", "dataset_sha256", "seed"] {
         text += &pair(key, &provenance[key]);
@@ -112,13 +119,12 @@ pub fn inspect_text(value: &Value) -> String {
 }
 
 /// What training covered, for people.
-fn trained(value: &Value) -> Value {
-    let (trained, refined) = (&value["trained"], &value["config"]["refined"]);
+fn trained(trained: &Value) -> Value {
     let missing = trained["missing"].as_object().into_iter().flatten().filter(|(_, missing)| **missing == json!(true));
     json!({
         "action_horizon": trained["action_horizons"],
         "sub_steps": trained["sub_steps"],
-        "kappa above 0": refined,
+        "kappa above 0": trained["refined"],
         "histories without": missing.map(|(part, _)| part).collect::<Vec<_>>(),
     })
 }

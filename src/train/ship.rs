@@ -3,7 +3,7 @@
 use super::{
     Task,
     learner::Learner,
-    probe::{Evidence, latent_means, places, spread},
+    probe::{latent_means, places, spread},
     stage1,
     stage2::RefineTask,
 };
@@ -11,7 +11,7 @@ use crate::model::{
     Networks,
     checkpoint::{Provenance, save},
     config::ModelConfig,
-    latent::LatentModel,
+    latent::{Evidence, LatentModel},
 };
 use anyhow::Result;
 use candle_core::Tensor;
@@ -55,7 +55,8 @@ pub fn product(task: &Task, learner: &Learner) -> Result<Product> {
     let errors = RefineTask::new(task).held_out_errors(&networks)?;
     let held_out_loss = errors.iter().sum::<f64>() / errors.len() as f64;
     let metrics = metrics(task, learner, &networks, &errors)?;
-    let config = ModelConfig { latent_spread, ..task.config.clone() };
+    let mut config = task.config.clone();
+    config.units.latent_spread = latent_spread;
     let recipe = &task.recipe;
     let provenance = Provenance {
         dataset: recipe.data.file_name().unwrap_or_default().to_string_lossy().into_owned(),
@@ -69,8 +70,8 @@ pub fn product(task: &Task, learner: &Learner) -> Result<Product> {
 
 /// How far the prior's mean of c_tau moves over the training data: what the sampler holds a latent jump against.
 fn latent_spread(task: &Task, latent: &LatentModel) -> Result<f32> {
-    let (episodes, block_len) = (&task.split.train, task.config.block_len);
-    let means = latent_means(latent, episodes, &places(episodes, SPREAD_ROWS), Evidence::Filter, block_len)?;
+    let episodes = &task.split.train;
+    let means = latent_means(latent, episodes, &places(episodes, SPREAD_ROWS), Evidence::Filter, task.looks())?;
     Ok(spread(&means) as f32)
 }
 
@@ -79,7 +80,7 @@ fn metrics(task: &Task, learner: &Learner, networks: &Networks, errors: &[f64]) 
     let probe = match &networks.latent {
         Some(latent) if task.split.train[0].context_dim > 0 => {
             let result = stage1::gate(task, latent)?;
-            json!({"filter": round(result.filter), "successor_state": round(result.successor_state)})
+            json!({"filter": round(result.filter), "successor_state": result.successor_state.map(round)})
         }
         _ => Value::Null,
     };

@@ -5,17 +5,19 @@
 
 use super::{
     Task,
-    dataset::window::{BlockShape, Places, blocks},
+    dataset::{
+        HELD_OUT_SEED,
+        window::{BlockShape, Places, blocks},
+    },
     learner::{Learner, Scalars},
-    probe::{Evidence, Subjects, latent_probe, places},
-    recipe::{Gate, Recipe, Stage1},
+    probe::{Subjects, latent_probe, places, probed},
+    recipe::{Gate, Stage1},
     ridge::Table,
-    stage2::HELD_OUT_SEED,
 };
 use crate::model::Networks;
 use crate::model::{
     latent::{
-        LatentModel,
+        Evidence, LatentModel,
         elbo::{ElboBatch, ElboOptions},
     },
     noise::Philox,
@@ -40,19 +42,18 @@ pub struct ElboTask<'a> {
 impl<'a> ElboTask<'a> {
     /// None for recipes without latents.
     pub fn new(task: &'a Task) -> Option<Self> {
-        let (stage, latent) = (task.recipe.stage1.as_ref()?, task.config.latent.as_ref()?);
-        let block_len = task.config.block_len;
+        let (stage, latent) = (task.recipe.stage1.as_ref()?, task.config.method.latent.gru()?);
+        let block_len = latent.block_len();
         let shape = BlockShape {
             batch: stage.batch,
             len: block_len + 1 + stage.length,
-            before: block_len,
+            looks: latent.looks,
             latent_dim: latent.dim,
             show_action: stage.show_action,
             show_reward: stage.show_reward,
             hide: task.recipe.hide,
         };
-        let places = Places::new(&task.split.train, block_len, shape.len);
-        Some(Self { task, stage, shape, places })
+        Some(Self { task, stage, places: shape.places(&task.split.train), shape })
     }
 
     /// The batch of this step.
@@ -70,7 +71,7 @@ impl<'a> ElboTask<'a> {
     pub fn loss(&self, networks: &Networks, batch: &ElboBatch, kl_weight: f64) -> Result<(Tensor, Scalars)> {
         let options = ElboOptions {
             kl_weight,
-            state_change_std: self.task.config.normalizer.state_change_std.clone(),
+            state_change_std: self.task.config.units.normalizer.state_change_std.clone(),
             reward_weight: self.stage.reward_weight,
         };
         let latent = networks.latent.as_ref().context("stage 1 needs a latent model: is a bug")?;
@@ -91,7 +92,7 @@ impl<'a> ElboTask<'a> {
     /// If a tensor operation fails.
     pub fn held_out_loss(&self, networks: &Networks) -> Result<Option<f64>> {
         let (episodes, shape) = (&self.task.split.held_out, BlockShape { batch: HELD_OUT_BLOCKS, ..self.shape.clone() });
-        let places = Places::new(episodes, shape.before, shape.len);
+        let places = shape.places(episodes);
         if places.is_empty() {
             return Ok(None);
         }
@@ -120,14 +121,14 @@ impl<'a> ElboTask<'a> {
 pub struct GateResult {
     /// Standardised error without the successor.
     pub filter: f64,
-    /// Standardised error with the successor's state.
-    pub successor_state: f64,
+    /// Standardised error with the successor's state; none of a belief that is held, for it does not wait for one.
+    pub successor_state: Option<f64>,
 }
 
 impl GateResult {
     /// Whether both errors are within the bounds.
     pub fn passes(&self, gate: &Gate) -> bool {
-        self.filter <= gate.filter && self.successor_state <= gate.successor_state
+        self.filter <= gate.filter && self.successor_state.is_none_or(|error| error <= gate.successor_state)
     }
 }
 
@@ -137,8 +138,9 @@ impl GateResult {
 /// If the data have no context, or a tensor operation fails.
 pub fn gate(task: &Task, latent: &LatentModel) -> Result<GateResult> {
     let subjects = Subjects { train: &task.split.train, held_out: &task.split.held_out, rows_max: GATE_ROWS };
-    let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.config.block_len, &[0])?[0].error) };
-    Ok(GateResult { filter: error(Evidence::Filter)?, successor_state: error(Evidence::SuccessorState)? })
+    let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.looks(), &[0])?[0].error) };
+    let successor_state = probed(latent).contains(&Evidence::SuccessorState).then(|| error(Evidence::SuccessorState)).transpose()?;
+    Ok(GateResult { filter: error(Evidence::Filter)?, successor_state })
 }
 
 /// Whether the contexts that the gate holds the latent against differ at all: an error in units of their variance needs one.
@@ -148,13 +150,8 @@ pub fn gate(task: &Task, latent: &LatentModel) -> Result<GateResult> {
 pub fn contexts_vary(task: &Task) -> Result<bool> {
     let episodes = &task.split.held_out;
     let mut truth = Table::new(episodes.first().map_or(0, |episode| episode.context_dim));
-    for (episode, t) in places(episodes, GATE_ROWS).into_iter().filter(|(_, t)| *t >= task.config.block_len) {
+    for (episode, t) in places(episodes, GATE_ROWS).into_iter().filter(|(_, t)| *t >= task.config.method.latent.block_len()) {
         truth.values.extend(episodes[episode].context(t)?.iter().map(|value| f64::from(*value)));
     }
     Ok(truth.varies())
-}
-
-/// Seed of the weights of one attempt.
-pub fn attempt_seed(recipe: &Recipe, attempt: usize) -> u64 {
-    recipe.seed + 1000 * attempt as u64
 }

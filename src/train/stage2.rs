@@ -3,24 +3,27 @@
 use super::{
     Task,
     dataset::{
+        HELD_OUT_SEED,
         hidden::Hide,
-        window::{Places, WindowShape, windows},
+        window::{Levels, Places, WindowShape, windows},
     },
     learner::{Learner, Scalars},
     parallel::side_by_side,
+    recipe::TrainingLevels,
     stage1::ElboTask,
 };
 use crate::model::{
     Networks,
-    diffusion::refine::{RefineOptions, WindowBatch},
+    diffusion::{
+        refine::{RefineOptions, WindowBatch},
+        schedule::Table,
+    },
     noise::Philox,
 };
 use anyhow::Result;
 use candle_core::backprop::GradStore;
 use std::ops::Range;
 
-/// Seed of the held-out batches: the same for all runs, so that their errors can be compared.
-pub(super) const HELD_OUT_SEED: u64 = 0xE7A1;
 /// Held-out windows for each row of the ladder.
 const HELD_OUT_WINDOWS: usize = 256;
 
@@ -49,13 +52,17 @@ struct Part {
 impl<'a> RefineTask<'a> {
     /// The stage as the recipe has it.
     pub fn new(task: &'a Task) -> Self {
-        let (stage, sampler) = (&task.recipe.stage2, &task.recipe.sampler);
+        let (stage, sampler, plan) = (&task.recipe.stage2, &task.recipe.sampler, &task.config.method.plan);
         let shape = WindowShape {
             batch: stage.batch,
-            plan_horizon: task.config.plan_horizon,
-            block_len: task.config.block_len,
-            obs_horizon: task.config.obs_horizon,
-            sub_steps: sampler.sub_steps,
+            horizon: plan.horizon,
+            looks: task.looks(),
+            obs_horizon: plan.obs_horizon,
+            table: Table::new(plan.schedule, plan.horizon, sampler.sub_steps, plan.level_max).expect("the recipe was checked: is a bug"),
+            levels: match stage.levels {
+                TrainingLevels::Schedule => Levels::Schedule,
+                TrainingLevels::Independent => Levels::Independent { level_max: plan.level_max },
+            },
             action_horizons: task.recipe.action_horizons(),
             ready_fraction: stage.ready_fraction,
             hide: task.recipe.hide,
@@ -78,7 +85,7 @@ impl<'a> RefineTask<'a> {
         let elbo = elbo.map(|(elbo, stage1)| Ok::<_, anyhow::Error>((elbo, elbo.batch(&mut rng)?, stage1.kl_weight.end))).transpose()?;
         let (networks, weight) = (&learner.networks, stage.elbo_weight);
         let mut jobs: Vec<Box<dyn FnOnce() -> Result<Part> + Send>> = Vec::new();
-        for shard in shards(batch.rows.len()) {
+        for shard in shards(batch.at.len()) {
             let batch = &batch;
             jobs.push(Box::new(move || self.shard(networks, batch, shard)));
         }
@@ -107,8 +114,8 @@ impl<'a> RefineTask<'a> {
 
     /// Loss and gradients of one shard of a batch, weighted by its share.
     fn shard(&self, networks: &Networks, batch: &WindowBatch, shard: Range<usize>) -> Result<Part> {
-        let terms = networks.refine_loss(&self.task.config, &batch.narrow(shard.start, shard.len())?, &self.options)?;
-        let loss = terms.loss.affine(shard.len() as f64 / batch.rows.len() as f64, 0.0)?;
+        let terms = networks.refine_loss(&self.task.config.method.plan, &batch.narrow(shard.start, shard.len())?, &self.options)?;
+        let loss = terms.loss.affine(shard.len() as f64 / batch.at.len() as f64, 0.0)?;
         let sums = [terms.prior, terms.posterior].map(|(mean, count)| (f64::from(mean) * count as f64, count));
         Ok(Part { grads: loss.backward()?, sums, loss: f64::from(loss.to_scalar::<f32>()?), scalars: Vec::new() })
     }
@@ -119,11 +126,11 @@ impl<'a> RefineTask<'a> {
     /// If a tensor operation fails.
     pub fn held_out_errors(&self, networks: &Networks) -> Result<Vec<f64>> {
         let shape = WindowShape { batch: HELD_OUT_WINDOWS, hide: Hide::NOTHING, ..self.shape.clone() };
-        let (episodes, rows) = (&self.task.split.held_out, shape.sub_steps * shape.plan_horizon);
+        let (episodes, rows) = (&self.task.split.held_out, shape.table.emit());
         let places = shape.places(episodes);
         let error = |row: usize| -> Result<f64> {
             let batch = windows(episodes, &places, &shape, Some(row), &mut Philox::new(HELD_OUT_SEED))?;
-            Ok(f64::from(networks.refine_loss(&self.task.config, &batch, &self.options)?.loss.to_scalar::<f32>()?))
+            Ok(f64::from(networks.refine_loss(&self.task.config.method.plan, &batch, &self.options)?.loss.to_scalar::<f32>()?))
         };
         (0..rows).map(error).collect()
     }

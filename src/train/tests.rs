@@ -90,9 +90,9 @@ fn what_is_shipped_loads_and_says_where_it_comes_from() {
     let dir = tempfile::tempdir().unwrap();
     train(&["stage1.steps=2", "stage2.steps=3"], dir.path(), None).unwrap();
     let agent = checkpoint::load(dir.path()).unwrap();
-    assert!(agent.spec().refined);
+    assert!(agent.spec().trained.refined);
     assert_eq!((agent.config().layout.state_dim, agent.config().layout.action_dim), (3, 2));
-    assert!(agent.config().latent_spread > 0.0);
+    assert!(agent.config().units.latent_spread > 0.0);
     let (manifest, _) = checkpoint::load_manifest(dir.path()).unwrap();
     let provenance = manifest.provenance;
     assert_eq!((provenance.dataset.as_str(), provenance.seed), ("data_good.h5", 3));
@@ -109,7 +109,9 @@ fn what_is_shipped_loads_and_says_where_it_comes_from() {
 /// A model without latents has no stage 1, and is not said to be refined.
 #[test]
 fn a_baseline_skips_stage_1() {
-    let text = RECIPE.replace("latent = { dim = 2, hidden = 4 }\n", "").replace("elbo_weight = 0.1", "elbo_weight = 0.0");
+    let text = RECIPE
+        .replace("latent = { kind = \"gru\", dim = 2, hidden = 4, looks = { block = 3 } }\n", "")
+        .replace("elbo_weight = 0.1", "elbo_weight = 0.0");
     let (start, end) = (text.find("[stage1]").unwrap(), text.find("[stage2]").unwrap());
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("recipe.toml");
@@ -118,7 +120,7 @@ fn a_baseline_skips_stage_1() {
     let out = dir.path().join("out");
     assert_eq!(run(recipe, options(&out, None)).unwrap(), Outcome::Finished);
     let agent = checkpoint::load(&out).unwrap();
-    assert!(!agent.spec().refined && agent.networks().latent.is_none());
+    assert!(!agent.spec().trained.refined && agent.networks().latent.is_none());
 }
 
 /// A learning rate that makes the loss NaN: the run ends with one error, and the state of the last checkpoint is still there.
@@ -163,14 +165,14 @@ fn wrong_recipes_name_the_key() {
     for (text, key) in [
         ("stage2.bacth=3", "bacth"),
         ("stage2.steps=many", "steps"),
-        ("model.level_max=7", "level_max"),
-        ("model.denoiser.widths=[8, 8, 8, 8]", "model.denoiser.widths"),
+        ("model.plan.level_max=7", "level_max"),
+        ("model.plan.backbone.widths=[8, 8, 8, 8]", "model.plan.backbone.widths"),
         ("sampler.action_horizon=5", "sampler.action_horizon"),
         ("sampler.kappa=-1.0", "sampler.kappa"),
         ("name=\"Half Cheetah\"", "`name`"),
         ("stage2.elbo_weight=inf", "stage2.elbo_weight"),
         ("stage1.weight_decay=-1.0", "stage1.weight_decay"),
-        ("model.denoiser={kind = \"dit\", width = 9, depth = 1, heads = 3}", "model.denoiser.width"),
+        ("model.plan.backbone={kind = \"dit\", width = 9, depth = 1, heads = 3}", "model.plan.backbone.width"),
         ("stage2.ready_fraction=1.5", "stage2.ready_fraction"),
         ("stage1.learning_rate.end=1.0", "stage1.learning_rate.end"),
         ("stage2.routing=leaky", "leaky"),

@@ -3,11 +3,12 @@
 
 use ada_diffuser::model::{
     Networks,
-    agent::{Agent, Descent, Episode, LatentMode, Observation, SamplerOptions, Start},
+    agent::{Act, Agent, Episode, Observation, Start},
     config::{ModelConfig, Restart},
-    denoiser::DenoiserConfig,
-    latent::LatentConfig,
+    method::Backbone,
+    method::{Future, GruLatent, Looks},
     nn::Params,
+    options::{LatentMode, SamplerOptions},
     trajectory::Layout,
 };
 use std::{
@@ -43,35 +44,34 @@ fn asked_during(work: impl FnOnce()) -> usize {
     ASKED.get() - before
 }
 
-fn agent(denoiser: DenoiserConfig, obs_horizon: usize) -> Agent {
-    let plain = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, Some(LatentConfig { dim: 5, hidden: 16 }), denoiser);
+fn agent(backbone: Backbone, obs_horizon: usize) -> Agent {
+    let latent = GruLatent { dim: 5, hidden: 16, looks: Looks::Block(4), future: Future::Prior };
+    let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, Some(latent), backbone);
+    config.method.plan.obs_horizon = obs_horizon;
     // Every warm act is noised again a little.
-    let restart = Restart { renoise_distance: 0.0, cold_distance: 1e7, latent_jump: f32::INFINITY };
-    let config = ModelConfig { obs_horizon, restart, ..plain };
+    config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e7, latent_jump: f32::INFINITY };
     let fresh = Params::fresh(1);
-    Networks::new(&config, &fresh).unwrap();
+    Networks::new(config.layout, &config.method, &fresh).unwrap();
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
-    Agent::new(config.clone(), Networks::new(&config, &Params::loaded(tensors)).unwrap(), "test".into())
+    Agent::new(config.clone(), Networks::new(config.layout, &config.method, &Params::loaded(tensors)).unwrap(), "test".into())
 }
 
 /// The next acts of a batch of sessions.
-fn descents(agent: &Agent, episodes: &[Episode]) -> Vec<Descent> {
+fn acts(agent: &Agent, episodes: &[Episode]) -> Vec<Act> {
     let observation = Observation { state: vec![0.3, -0.2, 0.1], ..Observation::default() };
     episodes.iter().map(|episode| agent.begin(episode, &observation).unwrap()).collect()
 }
 
-fn go_down(agent: &Agent, descents: &mut Vec<Descent>) {
-    while !descents.is_empty() {
-        agent.advance(descents).unwrap();
-        descents.retain(|descent| !descent.is_done());
+fn go_down(agent: &Agent, acts: &mut Vec<Act>) {
+    while !acts.is_empty() {
+        agent.advance(acts).unwrap();
+        acts.retain(|act| !act.is_done());
     }
 }
 
 #[test]
 fn a_tick_allocates_nothing() {
-    for (denoiser, obs_horizon) in
-        [(DenoiserConfig::Unet { widths: vec![8, 16, 16] }, 1), (DenoiserConfig::Dit { width: 16, depth: 2, heads: 2 }, 3)]
-    {
+    for (denoiser, obs_horizon) in [(Backbone::Unet { widths: vec![8, 16, 16] }, 1), (Backbone::Dit { width: 16, depth: 2, heads: 2 }, 3)] {
         let agent = agent(denoiser, obs_horizon);
         let options = |i: u64| SamplerOptions {
             eta: 1.0,
@@ -87,9 +87,9 @@ fn a_tick_allocates_nothing() {
         let episodes: Vec<Episode> = opened.iter().map(|episode| agent.act(episode, &observation).unwrap().0).collect();
         let starts: Vec<Start> = episodes.iter().map(|episode| agent.act(episode, &observation).unwrap().1.start).collect();
         assert!(starts.contains(&Start::Cold) && starts.contains(&Start::Renoised(2)), "{starts:?}");
-        go_down(&agent, &mut descents(&agent, &episodes));
-        let mut again = descents(&agent, &episodes);
-        assert!(asked_during(|| drop(descents(&agent, &episodes))) > 0, "the counter counts");
+        go_down(&agent, &mut acts(&agent, &episodes));
+        let mut again = acts(&agent, &episodes);
+        assert!(asked_during(|| drop(acts(&agent, &episodes))) > 0, "the counter counts");
         assert_eq!(asked_during(|| go_down(&agent, &mut again)), 0);
     }
 }

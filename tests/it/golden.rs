@@ -2,9 +2,10 @@
 //! commit (`ADA_GOLDEN=write cargo test --release golden` writes it). The law of bits makes one file do for every processor.
 
 use ada_diffuser::model::{
-    agent::{Agent, Chunk, Episode, Executed, LatentMode, Observation, SamplerOptions},
+    agent::{Agent, Chunk, Episode, Executed, Observation},
     checkpoint,
     noise::Philox,
+    options::{LatentMode, SamplerOptions},
 };
 use sha2::{Digest, Sha256};
 use std::{collections::BTreeMap, fs, path::Path};
@@ -48,7 +49,7 @@ fn shipped_checkpoints_answer_with_the_same_bits() {
 
 /// SHA-256 of 64 acts of one episode, or why the checkpoint refuses the mode.
 fn digest(agent: &Agent, (_, options, allowance): &Mode) -> String {
-    let mut episode = match agent.open(7, &options(agent.config().sampler.clone())) {
+    let mut episode = match agent.open(7, &options(agent.config().defaults.sampler.clone())) {
         Ok(episode) => episode,
         Err(error) => return format!("refused: {error}"),
     };
@@ -66,27 +67,27 @@ fn digest(agent: &Agent, (_, options, allowance): &Mode) -> String {
 }
 
 fn run(agent: &Agent, episode: &Episode, observation: &Observation, allowance: Option<usize>) -> (Episode, Chunk) {
-    let mut descents = [agent.begin(episode, observation).unwrap()];
-    descents[0].allow(allowance);
-    while !descents[0].is_done() {
-        agent.advance(&mut descents).unwrap();
+    let mut acts = [agent.begin(episode, observation).unwrap()];
+    acts[0].allow(allowance);
+    while !acts[0].is_done() {
+        agent.advance(&mut acts).unwrap();
     }
-    let [descent] = descents;
-    agent.finish(descent).unwrap()
+    let [act] = acts;
+    agent.finish(act).unwrap()
 }
 
 /// A state as the data have them.
 fn drawn_state(agent: &Agent, stream: &mut Philox) -> Vec<f32> {
-    let affine = &agent.config().normalizer.state;
+    let affine = &agent.config().units.normalizer.state;
     affine.mean.iter().zip(&affine.std).map(|(mean, std)| mean + std * stream.normal()).collect()
 }
 
 /// Near what was predicted, now and then far from it; executed steps are reported in every way there is.
 fn what_follows(agent: &Agent, act: usize, chunk: &Chunk, stream: &mut Philox) -> Observation {
-    let std = &agent.config().normalizer.state.std;
+    let std = &agent.config().units.normalizer.state.std;
     let near = chunk.predicted_state.iter().zip(std).map(|(state, std)| state + 0.3 * std * stream.normal()).collect();
     let state = if act % 16 == 9 { drawn_state(agent, stream) } else { near };
-    let reward = agent.config().normalizer.reward.mean[0] + stream.normal();
+    let reward = agent.config().units.normalizer.reward.mean[0] + stream.normal();
     let step = |action: &Vec<f32>| Executed { reward: Some(reward), action: (act % 3 == 2).then(|| action.clone()), state: None };
     let executed = if act.is_multiple_of(5) { Vec::new() } else { chunk.actions.iter().map(step).collect() };
     Observation { state, executed, ..Observation::default() }

@@ -97,29 +97,30 @@ def _cases() -> dict[str, Callable[[Path], None]]:
         change(checkpoint)
         cases[name] = checkpoint.write
 
-    for path in ("plan_horizon", "block_len", "obs_horizon", "level_max"):
+    plan = "method.plan"
+    for path in (f"{plan}.horizon", "method.latent.looks.block", f"{plan}.obs_horizon", f"{plan}.level_max"):
         for value in (0, -1, 10**12):
             sealed(f"absurd-{path}-{value}", lambda one, path=path, value=value: _set(one.config, path, value))
     absurd = {
-        "latent.dim": 10**9,
+        "method.latent.dim": 10**9,
         "layout.state_dim": 10**9,
-        "denoiser.widths": [10**9],
-        "state_clip": 0,
-        "action_low.0": 5.0,
-        "sampler.sub_steps": 2**61,
-        "sampler.action_horizon": 10**9,
-        "sampler.kappa": -1.0,
-        "sampler.temperature": -1.0,
+        f"{plan}.backbone.widths": [10**9],
+        f"{plan}.clip": 0,
+        "units.action_low.0": 5.0,
+        "defaults.sampler.sub_steps": 2**61,
+        "defaults.sampler.action_horizon": 10**9,
+        "defaults.sampler.kappa": -1.0,
+        "defaults.sampler.temperature": -1.0,
     }
     for path, value in absurd.items():
         sealed(f"absurd-{path}", lambda one, path=path, value=value: _set(one.config, path, value))
-    config = Checkpoint().config
-    numbers = [name for name, value in config.items() if isinstance(value, (int, float)) and not isinstance(value, bool)]
-    for name in list(config)[:8]:
-        sealed(f"mistyped-{name}", lambda one, name=name: one.config.update({f"{name}x": one.config.pop(name)}))
-    for name in numbers[:6]:
-        sealed(f"worded-{name}", lambda one, name=name: one.config.update({name: str(one.config[name])}))
-        sealed(f"listed-{name}", lambda one, name=name: one.config.update({name: [one.config[name]]}))
+    leaves = dict(_leaves(Checkpoint().config))
+    for path in list(leaves)[:8]:
+        sealed(f"mistyped-{path}", lambda one, path=path: _rename(one.config, path))
+    numbers = [path for path, value in leaves.items() if isinstance(value, (int, float)) and not isinstance(value, bool)]
+    for path in numbers[:6]:
+        sealed(f"worded-{path}", lambda one, path=path: _set(one.config, path, str(leaves[path])))
+        sealed(f"listed-{path}", lambda one, path=path: _set(one.config, path, [leaves[path]]))
     for name, text in {"deep": b"[" * 500_000, "text": b"\xff" * 100, "empty": b"", "large": b"{" + b" " * 5_000_000}.items():
         sealed(f"config-{name}", lambda one, text=text: setattr(one, "config_bytes", text))
     _harm_weights(sealed)
@@ -186,6 +187,23 @@ def _replaced(make: Callable[[Path], object]) -> Callable[[Path], object]:
 def _flipped(data: bytes) -> bytes:
     at = data.index(b'"sha256": "') + 12 if b'"sha256": "' in data else len(data) // 2
     return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+
+def _leaves(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """All values that are no objects, by dotted path."""
+    for name, value in config.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _rename(config: dict[str, Any], path: str) -> None:
+    """Mistypes the last name of a dotted path."""
+    *parents, name = path.split(".")
+    for parent in parents:
+        config = config[parent]
+    config[f"{name}x"] = config.pop(name)
 
 
 def _set(config: Json, path: str, value: object) -> None:

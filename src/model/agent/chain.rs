@@ -1,4 +1,4 @@
-//! The latents of an act in progress.
+//! The latents of an act in progress, each known from the one before by the prior.
 
 use crate::model::latent::GaussianRef;
 use std::ops::Range;
@@ -37,9 +37,11 @@ impl Chain {
         self.dim
     }
 
-    /// Position 0 has been given out: the next one takes its place.
-    pub(super) fn advance(&mut self) {
-        self.first += 1;
+    /// So many positions have been given out: the next one takes the place of position 0.
+    pub(super) fn advance(&mut self, positions: usize) {
+        if !self.is_empty() {
+            self.first += positions;
+        }
     }
 
     /// Mean and log-variance at the act's first position.

@@ -1,23 +1,31 @@
 //! An agent: a trained model and the rules by which one episode turns observations into action chunks (section 4.4 of the paper; algorithm 3).
 //!
-//! `act` is a function `(Episode, Observation) -> (Episode, Chunk)`. An act in progress is a [`Descent`]; each [`Agent::advance`] costs one
-//! denoiser forward, shared by all descents given to it, whatever rungs they stand on.
-mod advance;
+//! `act` is a function `(Episode, Observation) -> (Episode, Chunk)`. An act in progress is an [`Act`], which asks; each [`Agent::advance`]
+//! answers all that is asked, with one denoiser forward shared by all acts given to it, whatever rungs they stand on.
+mod act;
+mod answers;
 mod chain;
-mod descent;
 mod episode;
-mod hurry;
+mod executed;
+mod restart;
+mod rows;
 mod types;
 
 #[cfg(test)]
 mod tests;
 
-pub use descent::Descent;
+pub use act::{Act, Ask};
 pub use episode::Episode;
-pub(in crate::model) use types::infinity_as_null;
-pub use types::{AgentError, Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start};
+pub use types::{AgentError, Chunk, Executed, Observation, Spec, Start};
 
-use crate::model::{Networks, config::ModelConfig, diffusion::ladder::Ladder, diffusion::process::Process};
+use crate::model::{
+    Networks,
+    columns::{Bounds, Columns},
+    config::ModelConfig,
+    diffusion::{descent::Walk, process::Process, schedule::Table},
+    method::GruLatent,
+    options::SamplerOptions,
+};
 
 /// Largest state or reward that is taken, in standard deviations of the data.
 const FAR_MAX: f32 = 1e6;
@@ -27,6 +35,8 @@ pub struct Agent {
     config: ModelConfig,
     networks: Networks,
     process: Process,
+    columns: Columns,
+    bounds: Bounds,
     spec: Spec,
 }
 
@@ -35,19 +45,20 @@ impl Agent {
     pub fn new(config: ModelConfig, networks: Networks, digest: String) -> Self {
         let spec = Spec {
             layout: config.layout,
-            plan_horizon: config.plan_horizon,
-            block_len: config.block_len,
-            obs_horizon: config.obs_horizon,
-            latent_dim: config.latent.as_ref().map_or(0, |latent| latent.dim),
-            level_max: config.level_max,
-            action_low: config.action_low.clone(),
-            action_high: config.action_high.clone(),
-            sampler: config.sampler.clone(),
-            refined: config.refined,
-            trained: config.trained(),
+            plan_horizon: config.method.plan.horizon,
+            block_len: config.method.latent.block_len(),
+            obs_horizon: config.method.plan.obs_horizon,
+            latent_dim: config.method.latent.dim(),
+            level_max: config.method.plan.level_max,
+            action_low: config.units.action_low.clone(),
+            action_high: config.units.action_high.clone(),
+            sampler: config.defaults.sampler.clone(),
+            trained: config.trained.clone(),
             digest,
         };
-        Self { process: Process::cosine(config.level_max), config, networks, spec }
+        let columns = Columns::state_action(config.layout);
+        let bounds = Bounds::new(&columns, config.method.plan.clip, &config.units);
+        Self { process: Process::cosine(config.method.plan.level_max), columns, bounds, config, networks, spec }
     }
 
     /// What a client must know of it.
@@ -71,7 +82,8 @@ impl Agent {
     /// [`AgentError::InvalidOptions`] if an option does not fit the model.
     pub fn open(&self, seed: u64, options: &SamplerOptions) -> Result<Episode, AgentError> {
         self.config.check_options(options).map_err(|(field, reason)| AgentError::InvalidOptions { field, reason })?;
-        Ok(Episode::new(seed, options.clone()))
+        let memory = self.config.method.latent.gru().map_or(0, GruLatent::memory_len);
+        Ok(Episode::new(seed, options.clone(), memory))
     }
 
     /// A new episode with the options of an old one. With `keep_history` the latent goes on looking back on the old one's last steps,
@@ -80,34 +92,43 @@ impl Agent {
         episode.reset(seed, keep_history)
     }
 
-    /// Checks the observation and starts an act on a copy of the episode; no network evaluation yet.
+    /// Checks the observation and begins an act on a copy of the episode; no network evaluation yet.
     ///
     /// # Errors
     /// [`AgentError::InvalidObservation`] naming the field.
-    pub fn begin(&self, episode: &Episode, observation: &Observation) -> Result<Descent, AgentError> {
+    pub fn begin(&self, episode: &Episode, observation: &Observation) -> Result<Act, AgentError> {
         let state = self.state("state", &observation.state)?;
         let mut episode = episode.clone();
         let executed = self.executed_tokens(&episode, observation)?;
-        let aligned = executed.len() == episode.options.action_horizon;
-        episode.commit(executed, self.config.block_len.max(self.config.obs_horizon));
-        let ladder = Ladder::new(self.config.plan_horizon, episode.options.sub_steps, self.config.level_max);
-        let ladder = ladder.map_err(|reason| AgentError::InvalidOptions { field: "sub_steps", reason })?;
-        Ok(Descent::new(episode, state, ladder, aligned, &self.config))
+        let (options, plan) = (episode.options(), &self.config.method.plan);
+        let aligned = executed.len() == options.action_horizon;
+        let table = Table::new(plan.schedule, plan.horizon, options.sub_steps, plan.level_max);
+        let table = table.map_err(|reason| AgentError::InvalidOptions { field: "sub_steps", reason })?;
+        episode.commit(executed, self.config.method.latent.block_len().max(plan.obs_horizon));
+        Ok(Act::new(episode, state, table, aligned, &self.config))
+    }
+
+    /// One denoiser forward shared by all these acts, none of which is done; acts do not influence each other.
+    ///
+    /// # Errors
+    /// [`AgentError::Tensor`] for a defect; an act whose output is not finite fails alone, at [`Agent::finish`].
+    pub fn advance(&self, acts: &mut [Act]) -> Result<(), AgentError> {
+        Ok(Ask::ORDER.into_iter().try_for_each(|ask| self.answer(ask, acts))?)
     }
 
     /// For an act that has no time for another evaluation: gives out what there is, and says whether there was anything: positions of the
-    /// last estimate or, if there is none yet, of the window that the act before left, as it is. Then the descent is done, and its chunk
+    /// last estimate or, if there is none yet, of the window that the act before left, as it is. Then the act is done, and its chunk
     /// marked degraded.
-    pub fn cut_short(&self, descent: &mut Descent) -> bool {
-        descent.cut_short(self.walk())
+    pub fn cut_short(&self, act: &mut Act) -> bool {
+        act.cut_short(&self.config, self.walk())
     }
 
-    /// The new episode and the chunk of a descent that is done.
+    /// The new episode and the chunk of an act that is done.
     ///
     /// # Errors
     /// [`AgentError::NonFinite`] if the network gave NaN or infinity.
-    pub fn finish(&self, descent: Descent) -> Result<(Episode, Chunk), AgentError> {
-        descent.finish(&self.config)
+    pub fn finish(&self, act: Act) -> Result<(Episode, Chunk), AgentError> {
+        act.finish(&self.config, self.walk())
     }
 
     /// A whole act on its own: begin, advance until done, finish.
@@ -115,12 +136,16 @@ impl Agent {
     /// # Errors
     /// As those three.
     pub fn act(&self, episode: &Episode, observation: &Observation) -> Result<(Episode, Chunk), AgentError> {
-        let mut descents = [self.begin(episode, observation)?];
-        while !descents[0].is_done() {
-            self.advance(&mut descents)?;
+        let mut acts = [self.begin(episode, observation)?];
+        while !acts[0].is_done() {
+            self.advance(&mut acts)?;
         }
-        let [descent] = descents;
-        self.finish(descent)
+        let [act] = acts;
+        self.finish(act)
+    }
+
+    fn walk(&self) -> Walk<'_> {
+        Walk { process: &self.process, columns: &self.columns, bounds: &self.bounds }
     }
 
     /// Values of the right number, all finite.
@@ -134,7 +159,7 @@ impl Agent {
 
     /// A state, normalized.
     fn state(&self, field: &str, raw: &[f32]) -> Result<Vec<f32>, AgentError> {
-        let normalized = self.config.normalizer.state.normalize(&self.checked(field, raw, self.config.layout.state_dim)?);
+        let normalized = self.config.units.normalizer.state.normalize(&self.checked(field, raw, self.config.layout.state_dim)?);
         let far = |(index, value): (usize, &f32)| known(&format!("{field}[{index}]"), raw[index], *value);
         normalized.iter().enumerate().try_for_each(far)?;
         Ok(normalized)

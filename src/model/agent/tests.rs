@@ -2,11 +2,19 @@
 
 use super::*;
 use crate::model::{
-    config::Restart, denoiser::DenoiserConfig, latent::LatentConfig, nn::params::Params, noise::Philox, normalizer::Affine,
+    config::Restart,
+    latent::Evidence,
+    method::Schedule,
+    method::{Backbone, Future, GruLatent, Looks},
+    nn::params::Params,
+    noise::Philox,
+    normalizer::Affine,
+    options::LatentMode,
     trajectory::Layout,
 };
 
 mod executed;
+mod running;
 mod trained;
 
 const HORIZON: usize = 8;
@@ -15,19 +23,19 @@ fn options() -> SamplerOptions {
     SamplerOptions::default()
 }
 
-fn agent(latents: bool, obs_horizon: usize, denoiser: DenoiserConfig) -> Agent {
-    let latent = latents.then_some(LatentConfig { dim: 5, hidden: 16 });
+fn agent(latents: bool, obs_horizon: usize, denoiser: Backbone) -> Agent {
+    let latent = latents.then_some(GruLatent { dim: 5, hidden: 16, looks: Looks::Block(4), future: Future::Prior });
     let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, latent, denoiser);
-    config.normalizer.state = Affine { mean: vec![0.5, 0.0, -0.5], std: vec![2.0, 1.0, 0.5] };
-    config.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
-    config.sub_steps_trained = (1..=10).collect();
-    config.obs_horizon = obs_horizon;
-    let networks = Networks::new(&config, &Params::fresh(3)).unwrap();
+    config.units.normalizer.state = Affine { mean: vec![0.5, 0.0, -0.5], std: vec![2.0, 1.0, 0.5] };
+    config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
+    config.trained.sub_steps = (1..=10).collect();
+    config.method.plan.obs_horizon = obs_horizon;
+    let networks = Networks::new(config.layout, &config.method, &Params::fresh(3)).unwrap();
     Agent::new(config, networks, "test".into())
 }
 
-fn unet() -> DenoiserConfig {
-    DenoiserConfig::Unet { widths: vec![8, 16, 16] }
+fn unet() -> Backbone {
+    Backbone::Unet { widths: vec![8, 16, 16] }
 }
 
 fn observation(stream: &mut Philox) -> Observation {
@@ -63,7 +71,7 @@ fn evaluations_follow_the_formulas() {
 
 #[test]
 fn same_seed_same_bytes_other_seed_others() {
-    for agent in [agent(true, 1, unet()), agent(false, 3, DenoiserConfig::Dit { width: 16, depth: 1, heads: 2 })] {
+    for agent in [agent(true, 1, unet()), agent(false, 3, Backbone::Dit { width: 16, depth: 1, heads: 2 })] {
         let options = SamplerOptions { eta: 1.0, latent: LatentMode::Sample, ..options() };
         assert_eq!(run(&agent, 5, &options, 4), run(&agent, 5, &options, 4));
         assert_ne!(run(&agent, 5, &options, 1)[0].actions, run(&agent, 6, &options, 1)[0].actions);
@@ -84,7 +92,7 @@ fn a_batch_is_its_rows() {
     let observations: Vec<Observation> = (0..7).map(|_| observation(&mut stream)).collect();
     let episodes: Vec<Episode> = (0..7).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
     let alone: Vec<_> = episodes.iter().zip(&observations).map(|(episode, seen)| agent.act(episode, seen).unwrap()).collect();
-    let mut waiting: Vec<(usize, Descent)> = Vec::new();
+    let mut waiting: Vec<(usize, Act)> = Vec::new();
     let mut together: Vec<Option<(Episode, Chunk)>> = vec![None; 7];
     let mut next = 0;
     while together.iter().any(Option::is_none) {
@@ -92,10 +100,10 @@ fn a_batch_is_its_rows() {
             waiting.push((next, agent.begin(&episodes[next], &observations[next]).unwrap()));
             next += 1;
         }
-        let (indices, mut descents): (Vec<_>, Vec<_>) = waiting.into_iter().unzip();
-        agent.advance(&mut descents).unwrap();
-        let (done, rest): (Vec<_>, Vec<_>) = indices.into_iter().zip(descents).partition(|(_, descent)| descent.is_done());
-        done.into_iter().for_each(|(index, descent)| together[index] = Some(agent.finish(descent).unwrap()));
+        let (indices, mut acts): (Vec<_>, Vec<_>) = waiting.into_iter().unzip();
+        agent.advance(&mut acts).unwrap();
+        let (done, rest): (Vec<_>, Vec<_>) = indices.into_iter().zip(acts).partition(|(_, act)| act.is_done());
+        done.into_iter().for_each(|(index, act)| together[index] = Some(agent.finish(act).unwrap()));
         waiting = rest;
     }
     assert_eq!(together.into_iter().flatten().collect::<Vec<_>>(), alone);
@@ -123,7 +131,7 @@ fn a_warm_act_continues_the_ladder() {
     let (episode, first) = agent.act(&episode, &observation(&mut stream)).unwrap();
     assert_eq!(first.actions[0], two.actions[0]);
     // The state at position 0 is the imagined one at rung 1; hand the same numbers in as if they had been observed.
-    let raw = agent.config.normalizer.state.denormalize(&episode.window.as_ref().unwrap().x[..3]);
+    let raw = agent.config.units.normalizer.state.denormalize(&episode.stored().unwrap().window().x[..3]);
     let (_, second) = agent.act(&episode, &Observation { state: raw, ..Observation::default() }).unwrap();
     let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-4);
     assert!(close(&second.actions[0], &two.actions[1]), "{:?} {:?}", second.actions[0], two.actions[1]);
@@ -133,12 +141,12 @@ fn a_warm_act_continues_the_ladder() {
 fn surprise_and_latent_jumps_restart() {
     let mut agent = agent(true, 1, unet());
     let start_of_second = |agent: &Agent| run(agent, 1, &options(), 2)[1].start;
-    agent.config.restart = Restart { renoise_distance: 0.0, cold_distance: 1e6, latent_jump: f32::INFINITY };
+    agent.config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e6, latent_jump: f32::INFINITY };
     assert_eq!(start_of_second(&agent), Start::Renoised(2));
     assert_eq!(run(&agent, 1, &options(), 2)[1].evaluations, 3);
-    agent.config.restart = Restart { renoise_distance: 0.0, cold_distance: 0.0, latent_jump: f32::INFINITY };
+    agent.config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 0.0, latent_jump: f32::INFINITY };
     assert_eq!(start_of_second(&agent), Start::Cold);
-    agent.config.restart = Restart { renoise_distance: 1e6, cold_distance: 1e6, latent_jump: 0.0 };
+    agent.config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e6, latent_jump: 0.0 };
     assert_eq!(start_of_second(&agent), Start::Cold);
 }
 
@@ -168,7 +176,7 @@ fn history_reaches_the_latent_and_missing_parts_are_allowed() {
 #[test]
 fn bad_observations_name_the_field() {
     let mut agent = agent(true, 1, unet());
-    agent.config.missing_trained.action = false;
+    agent.config.trained.missing.action = false;
     let episode = agent.open(1, &options()).unwrap();
     let field = |state: Vec<f32>, executed| match agent.begin(&episode, &Observation { state, executed, ..Observation::default() }) {
         Err(AgentError::InvalidObservation { field, .. }) => field,
@@ -201,9 +209,9 @@ fn bad_options_name_the_field() {
     assert_eq!(field(&agent, SamplerOptions { eta: 1.5, ..options() }), "eta");
     assert_eq!(field(&agent, SamplerOptions { temperature: f32::NAN, ..options() }), "temperature");
     assert_eq!(field(&agent, SamplerOptions { kappa: -1.0, ..options() }), "kappa");
-    agent.config.refined = false;
+    agent.config.trained.refined = false;
     assert_eq!(field(&agent, options()), "kappa");
-    agent.config.sub_steps_trained = vec![3];
+    agent.config.trained.sub_steps = vec![3];
     assert_eq!(field(&agent, SamplerOptions { sub_steps: 2, ..options() }), "sub_steps");
 }
 
@@ -211,14 +219,14 @@ fn bad_options_name_the_field() {
 /// DDIM and DDPM loop over the same network and noise.
 #[test]
 fn one_position_is_the_plain_sampler() {
-    let mut agent = agent(false, 1, DenoiserConfig::Dit { width: 16, depth: 1, heads: 2 });
-    agent.config.plan_horizon = 1;
+    let mut agent = agent(false, 1, Backbone::Dit { width: 16, depth: 1, heads: 2 });
+    agent.config.method.plan.horizon = 1;
     for eta in [0.0, 1.0] {
         let options = SamplerOptions { sub_steps: 10, eta, ..options() };
         let state = [0.4, -0.1, 0.2];
         let observation = Observation { state: state.to_vec(), ..Observation::default() };
         let (_, chunk) = agent.act(&agent.open(3, &options).unwrap(), &observation).unwrap();
-        let expected = plain_sampler(&agent, &agent.config.normalizer.state.normalize(&state), &options);
+        let expected = plain_sampler(&agent, &agent.config.units.normalizer.state.normalize(&state), &options);
         assert_eq!(chunk.evaluations, 10);
         for (got, expected) in chunk.actions[0].iter().zip(expected) {
             assert!((f64::from(*got) - expected).abs() < 1e-4, "eta {eta}: {got} against {expected}");
@@ -229,7 +237,7 @@ fn one_position_is_the_plain_sampler() {
 /// Ten steps from level 40 to 0 for one position, in f64, in the form of posterior mean and variance (Ho et al. 2020, eq. 6 and 7, over a gap).
 fn plain_sampler(agent: &Agent, state: &[f32], options: &SamplerOptions) -> Vec<f64> {
     use crate::model::{
-        denoiser::Condition,
+        denoiser::Given,
         noise::{Noise, Slot},
     };
     use candle_core::{Device, Tensor};
@@ -244,7 +252,7 @@ fn plain_sampler(agent: &Agent, state: &[f32], options: &SamplerOptions) -> Vec<
         let (from, to) = (4 * step, 4 * (step - 1));
         (0..3).for_each(|column| x[column] = f64::from(state[column]));
         let input = Tensor::from_vec(x.iter().map(|v| *v as f32).collect(), (1, 1, 5), &Device::Cpu).unwrap();
-        let condition = Condition { levels: &[from as f32], latents: None, observed: None };
+        let condition = Given { levels: &[from as f32], latents: None, observed: None };
         let x0: Vec<f32> = agent.networks.denoiser.predict(&input, &condition).unwrap().flatten_all().unwrap().to_vec1().unwrap();
         let (a, b) = (agent.process.alpha_bar(from), agent.process.alpha_bar(to));
         let z = draw((step - 1) as u32, Slot::Jump);
@@ -269,19 +277,19 @@ fn rows_hold_the_real_state_and_refine_once_an_action() {
     let agent = agent(true, 1, unet());
     let options = SamplerOptions { sub_steps: 2, action_horizon: 3, ..options() };
     let mut stream = Philox::new(1);
-    let mut descents = [agent.begin(&agent.open(1, &options).unwrap(), &observation(&mut stream)).unwrap()];
-    let ladder = Ladder::new(HORIZON, 2, 40).unwrap();
+    let mut acts = [agent.begin(&agent.open(1, &options).unwrap(), &observation(&mut stream)).unwrap()];
+    let ladder = Table::new(Schedule::Ladder, HORIZON, 2, 40).unwrap();
     let (mut refined, mut emitted) = (0, 0);
-    while !descents[0].is_done() {
-        if descents[0].has_started() && descents[0].wants_refinement() {
-            let noise = [0, 1].map(|position| descents[0].noisy_token(position, agent.walk()).noise);
+    while !acts[0].is_done() {
+        if acts[0].asks(Ask::Refine) {
+            let noise = [0, 1].map(|position| acts[0].ahead(position, Evidence::Refinement, agent.walk()).noise);
             assert_eq!(noise, [ladder.level(2), ladder.level(4)].map(|level| agent.process.sigma(level)));
             refined += 1;
         }
-        agent.advance(&mut descents).unwrap();
-        emitted = descents[0].emitted();
+        agent.advance(&mut acts).unwrap();
+        emitted = acts[0].descent().given_len();
         if emitted == 0 {
-            assert_eq!(descents[0].x[..3], descents[0].state[..]);
+            assert_eq!(acts[0].descent().x()[..3], acts[0].descent().known()[..]);
         }
     }
     assert_eq!((refined, emitted), (3, 3));
@@ -301,13 +309,13 @@ fn an_allowance_makes_larger_jumps() {
     {
         let options = SamplerOptions { action_horizon, sub_steps, ..options() };
         let (episode, observation) = (agent.open(1, &options).unwrap(), observation(&mut Philox::new(1)));
-        let mut descents = [agent.begin(&episode, &observation).unwrap()];
-        descents[0].allow(Some(allowance));
-        while !descents[0].is_done() {
-            agent.advance(&mut descents).unwrap();
+        let mut acts = [agent.begin(&episode, &observation).unwrap()];
+        acts[0].allow(Some(allowance));
+        while !acts[0].is_done() {
+            agent.advance(&mut acts).unwrap();
         }
-        let [descent] = descents;
-        let (next, chunk) = agent.finish(descent).unwrap();
+        let [act] = acts;
+        let (next, chunk) = agent.finish(act).unwrap();
         let whole = agent.act(&episode, &observation).unwrap();
         assert_eq!(chunk.actions.len(), action_horizon);
         // Each action of a chunk takes at least one evaluation.
@@ -325,15 +333,16 @@ fn an_allowance_makes_larger_jumps() {
 fn a_jump_ends_at_ready() {
     let agent = agent(true, 1, unet());
     let episode = agent.open(1, &SamplerOptions { sub_steps: 3, ..options() }).unwrap();
-    let ready = Ladder::new(HORIZON, 3, 40).unwrap().ready();
+    let ready = Table::new(Schedule::Ladder, HORIZON, 3, 40).unwrap().ready().unwrap();
     for (allowance, row) in [(2, ready), (1, ready - 1 + 4)] {
-        let mut descents = [agent.begin(&episode, &observation(&mut Philox::new(1))).unwrap()];
-        agent.advance(&mut descents).unwrap();
-        descents[0].row = ready - 1;
-        descents[0].allow(Some(allowance));
-        agent.advance(&mut descents).unwrap();
+        let mut acts = [agent.begin(&episode, &observation(&mut Philox::new(1))).unwrap()];
+        agent.advance(&mut acts).unwrap();
+        let x = acts[0].descent().x().to_vec();
+        acts[0].descent_mut().stand_at(ready - 1, &x, &[]);
+        acts[0].allow(Some(allowance));
+        agent.advance(&mut acts).unwrap();
         // What passes READY by is emitted, and stands at READY with the next position.
-        assert_eq!((descents[0].row, descents[0].is_done()), (ready, row > ready));
+        assert_eq!((acts[0].descent().row(), acts[0].is_done()), (ready, row > ready));
     }
 }
 
@@ -351,7 +360,7 @@ fn cut_short_gives_the_window_as_it_is() {
         let (mut episode, whole) = agent.act(&fresh, &see()).unwrap();
         let mut row = HORIZON - 1;
         for _ in 0..2 {
-            let stored = episode.window.as_ref().unwrap().x.clone();
+            let stored = episode.stored().unwrap().window().x.clone();
             let mut cut = agent.begin(&episode, &see()).unwrap();
             assert!(agent.cut_short(&mut cut) && cut.is_done());
             let (next, chunk) = agent.finish(cut).unwrap();
@@ -359,11 +368,11 @@ fn cut_short_gives_the_window_as_it_is() {
             assert_eq!((&chunk.latent_mean, chunk.actions.len()), (&whole.latent_mean, action_horizon));
             for (i, action) in chunk.actions.iter().enumerate() {
                 let mut expected = stored[5 * i..5 * i + 5].to_vec();
-                agent.config.clip(&mut expected);
-                assert_eq!(*action, agent.config.normalizer.action.denormalize(&expected[3..]));
+                agent.bounds.hold(&mut expected);
+                assert_eq!(*action, agent.config.units.normalizer.action.denormalize(&expected[3..]));
             }
             row -= action_horizon;
-            let window = next.window.as_ref().unwrap();
+            let window = next.stored().unwrap().window();
             assert_eq!((window.row, &window.x[..(HORIZON - action_horizon) * 5]), (row, &stored[5 * action_horizon..]));
             episode = next;
         }
@@ -380,15 +389,15 @@ fn cut_short_after_an_estimate_gives_its_positions() {
     let (episode, observation) =
         (agent.open(1, &SamplerOptions { action_horizon: 3, ..options() }).unwrap(), observation(&mut Philox::new(7)));
     for ticks in [2, HORIZON] {
-        let mut descents = [agent.begin(&episode, &observation).unwrap()];
-        (0..ticks).for_each(|_| agent.advance(&mut descents).unwrap());
-        let [mut descent] = descents;
-        let (given, estimate) = (descent.emitted(), descent.x0().to_vec());
+        let mut acts = [agent.begin(&episode, &observation).unwrap()];
+        (0..ticks).for_each(|_| agent.advance(&mut acts).unwrap());
+        let [mut act] = acts;
+        let (given, estimate) = (act.descent().given_len(), act.descent().x0().to_vec());
         assert_eq!(given, ticks / HORIZON);
-        assert!(agent.cut_short(&mut descent) && descent.is_done());
-        let (_, chunk) = agent.finish(descent).unwrap();
+        assert!(agent.cut_short(&mut act) && act.is_done());
+        let (_, chunk) = agent.finish(act).unwrap();
         // An estimate whose position 0 was given out already stands one position further.
-        let action = |i: usize| agent.config.normalizer.action.denormalize(&estimate[5 * i + 3..5 * i + 5]);
+        let action = |i: usize| agent.config.units.normalizer.action.denormalize(&estimate[5 * i + 3..5 * i + 5]);
         assert_eq!(chunk.actions, [action(0), action(1), action(2)], "after {ticks} evaluations");
     }
 }

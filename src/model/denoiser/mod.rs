@@ -4,13 +4,12 @@ mod dit;
 mod unet;
 
 use crate::model::{
-    check::{Unfit, WIDTH_MAX, require, size},
-    config::ModelConfig,
+    fit::{Unfit, WIDTH_MAX, require, size},
+    method::{Backbone, Diffusion, Method},
     nn::{Activation::Silu, Linear, Value, params::Params, time_embedding::Sinusoid},
 };
 use candle_core::Result;
 use dit::Dit;
-use serde::{Deserialize, Serialize};
 use unet::Unet;
 
 /// Channels of the sinusoidal embedding of a position's level.
@@ -18,61 +17,39 @@ const LEVEL_CHANNELS: usize = 16;
 /// Hidden width of the embedding of real steps.
 const OBSERVED_HIDDEN: usize = 128;
 
-/// Which backbone, and its sizes.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
-pub enum DenoiserConfig {
-    /// Temporal U-Net (Janner et al. 2022) with a linear skip from input to output; `plan_horizon` must be divisible by
-    /// `2^(widths - 1)`.
-    Unet {
-        /// Channels of each depth.
-        widths: Vec<usize>,
-    },
-    /// Diffusion transformer (Peebles and Xie 2023), conditioned token by token, with the same skip. Keeps the absolute scale of states
-    /// that group norm over time removes, so it suits states far from the origin.
-    Dit {
-        /// Width of a token.
-        width: usize,
-        /// Number of blocks.
-        depth: usize,
-        /// Attention heads.
-        heads: usize,
-    },
-}
-
-impl DenoiserConfig {
-    /// Whether the sizes fit together and `plan_horizon`.
-    ///
-    /// # Errors
-    /// The first field that does not fit.
-    pub fn check(&self, plan_horizon: usize) -> std::result::Result<(), Unfit> {
-        match self {
-            Self::Unet { widths } => {
-                let halvings = widths.len().saturating_sub(1) as u32;
-                let divides = 1_usize.checked_shl(halvings).is_some_and(|factor| plan_horizon.is_multiple_of(factor));
-                let reason = format!("plan_horizon {plan_horizon} must be divisible by 2^(widths - 1) = 2^{halvings}");
-                require(!widths.is_empty(), "denoiser.widths", "must name at least one width")?;
-                require(divides, "denoiser.widths", reason)?;
-                widths.iter().try_for_each(|width| {
-                    size("denoiser.widths", *width, WIDTH_MAX)?;
-                    let groups = unet::GROUPS.min(*width);
-                    let reason = format!("{width} must be below {0} or a multiple of it", unet::GROUPS);
-                    require(width.is_multiple_of(groups), "denoiser.widths", reason)
-                })
-            }
-            Self::Dit { width, depth, heads } => {
-                size("denoiser.width", *width, WIDTH_MAX)?;
-                require(*width >= 4 && width.is_multiple_of(2), "denoiser.width", format!("is {width}, must be even and at least 4"))?;
-                require(*depth <= dit::DEPTH_MAX, "denoiser.depth", format!("is {depth}, must lie in 0..={}", dit::DEPTH_MAX))?;
-                let divides = *heads >= 1 && width.is_multiple_of(*heads);
-                require(divides, "denoiser.heads", format!("is {heads}, must divide denoiser.width {width}"))
-            }
+/// Whether the sizes of a backbone fit together and the horizon of its plan.
+///
+/// # Errors
+/// The first field that does not fit.
+pub(in crate::model) fn check(plan: &Diffusion) -> std::result::Result<(), Unfit> {
+    let field = |name: &str| format!("method.plan.backbone.{name}");
+    let horizon = plan.horizon;
+    match &plan.backbone {
+        Backbone::Unet { widths } => {
+            let halvings = widths.len().saturating_sub(1) as u32;
+            let divides = 1_usize.checked_shl(halvings).is_some_and(|factor| horizon.is_multiple_of(factor));
+            let reason = format!("the horizon {horizon} must be divisible by 2^(widths - 1) = 2^{halvings}");
+            require(!widths.is_empty(), field("widths"), "must name at least one width")?;
+            require(divides, field("widths"), reason)?;
+            widths.iter().try_for_each(|width| {
+                size(&field("widths"), *width, WIDTH_MAX)?;
+                let groups = unet::GROUPS.min(*width);
+                let reason = format!("{width} must be below {0} or a multiple of it", unet::GROUPS);
+                require(width.is_multiple_of(groups), field("widths"), reason)
+            })
+        }
+        Backbone::Dit { width, depth, heads } => {
+            size(&field("width"), *width, WIDTH_MAX)?;
+            require(*width >= 4 && width.is_multiple_of(2), field("width"), format!("is {width}, must be even and at least 4"))?;
+            require(*depth <= dit::DEPTH_MAX, field("depth"), format!("is {depth}, must lie in 0..={}", dit::DEPTH_MAX))?;
+            let divides = *heads >= 1 && width.is_multiple_of(*heads);
+            require(divides, field("heads"), format!("is {heads}, must divide the width {width}"))
         }
     }
 }
 
 /// What the denoiser knows beside the noisy window.
-pub struct Condition<'a, V> {
+pub struct Given<'a, V> {
     /// `B * T` levels, one a position, 0 ..= level_max.
     pub levels: &'a [f32],
     /// `(B, T, latent_dim)`, for models with latents.
@@ -81,7 +58,7 @@ pub struct Condition<'a, V> {
     pub observed: Option<&'a V>,
 }
 
-enum Backbone {
+enum Net {
     Unet(Box<Unet>),
     Dit(Box<Dit>),
 }
@@ -99,58 +76,58 @@ struct Inputs<'a, V> {
 /// The denoiser of a model.
 pub struct Denoiser {
     sinusoid: Sinusoid,
-    backbone: Backbone,
+    net: Net,
     input_skip: Linear,
     observed: Option<[Linear; 2]>,
 }
 
 impl Denoiser {
-    /// Networks under `params`' scope.
+    /// Networks under `params`' scope, for windows of `columns` columns.
     ///
     /// # Errors
     /// If a loaded parameter is missing or of another shape.
-    pub fn new(config: &ModelConfig, params: &Params) -> Result<Self> {
-        let d_out = config.layout.dim();
-        let d_in = d_out + config.latent.as_ref().map_or(0, |latent| latent.dim) + LEVEL_CHANNELS;
-        let (backbone, emb) = match &config.denoiser {
-            DenoiserConfig::Unet { widths } => (Backbone::Unet(Box::new(Unet::new(d_in, d_out, widths, params)?)), unet::EMB),
-            DenoiserConfig::Dit { width, depth, heads } => {
-                let sizes = [d_in, d_out, *width];
-                (Backbone::Dit(Box::new(Dit::new(sizes, [*depth, *heads], config.level_max, params)?)), *width)
+    pub fn new(columns: usize, method: &Method, params: &Params) -> Result<Self> {
+        let Diffusion { obs_horizon, level_max, backbone, .. } = &method.plan;
+        let d_in = columns + method.latent.dim() + LEVEL_CHANNELS;
+        let (net, emb) = match backbone {
+            Backbone::Unet { widths } => (Net::Unet(Box::new(Unet::new(d_in, columns, widths, params)?)), unet::EMB),
+            Backbone::Dit { width, depth, heads } => {
+                let sizes = [d_in, columns, *width];
+                (Net::Dit(Box::new(Dit::new(sizes, [*depth, *heads], *level_max, params)?)), *width)
             }
         };
-        let observed = match config.obs_horizon {
+        let observed = match *obs_horizon {
             0 | 1 => None,
             steps => Some([
-                Linear::new((steps - 1) * d_out, OBSERVED_HIDDEN, &params.scope("observed.0"))?,
+                Linear::new((steps - 1) * columns, OBSERVED_HIDDEN, &params.scope("observed.0"))?,
                 Linear::new(OBSERVED_HIDDEN, emb, &params.scope("observed.2"))?,
             ]),
         };
-        let sinusoid = Sinusoid::new(LEVEL_CHANNELS, config.level_max)?;
-        Ok(Self { sinusoid, backbone, input_skip: Linear::new(d_in, d_out, &params.scope("input_skip"))?, observed })
+        let sinusoid = Sinusoid::new(LEVEL_CHANNELS, *level_max)?;
+        Ok(Self { sinusoid, net, input_skip: Linear::new(d_in, columns, &params.scope("input_skip"))?, observed })
     }
 
     /// Estimate of the clean window, `(B, T, D)` to `(B, T, D)`. Row b depends on row b of the inputs alone.
     ///
     /// # Errors
     /// If a shape differs from the configuration, or a condition the network was built with is missing.
-    pub fn predict<V: Value>(&self, x: &V, condition: &Condition<V>) -> Result<V> {
+    pub fn predict<V: Value>(&self, x: &V, given: &Given<V>) -> Result<V> {
         let [batch, len, _] = x.shape()?;
-        if condition.levels.len() != batch * len {
-            candle_core::bail!("{} levels for {batch} windows of {len}", condition.levels.len());
+        if given.levels.len() != batch * len {
+            candle_core::bail!("{} levels for {batch} windows of {len}", given.levels.len());
         }
         let embedded = V::generate([batch, len, LEVEL_CHANNELS], |out| {
-            let rows = condition.levels.iter().zip(out.chunks_exact_mut(LEVEL_CHANNELS));
+            let rows = given.levels.iter().zip(out.chunks_exact_mut(LEVEL_CHANNELS));
             rows.for_each(|(level, out)| self.sinusoid.write(*level, out));
         })?;
-        let x = match condition.latents {
+        let x = match given.latents {
             Some(latents) => V::beside(&[x, latents, &embedded])?,
             None => V::beside(&[x, &embedded])?,
         };
-        let inputs = Inputs { x: &x, levels: condition.levels, observed: self.embed_observed(condition.observed)? };
-        let out = match &self.backbone {
-            Backbone::Unet(net) => net.forward(&inputs)?,
-            Backbone::Dit(net) => net.forward(&inputs)?,
+        let inputs = Inputs { x: &x, levels: given.levels, observed: self.embed_observed(given.observed)? };
+        let out = match &self.net {
+            Net::Unet(net) => net.forward(&inputs)?,
+            Net::Dit(net) => net.forward(&inputs)?,
         };
         out.plus(&self.input_skip.forward(&x)?)
     }

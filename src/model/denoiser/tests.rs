@@ -2,7 +2,8 @@
 
 use super::*;
 use crate::model::{
-    latent::LatentConfig,
+    config::ModelConfig,
+    method::{Future, GruLatent, Looks},
     nn::{Buffer, Precision, kernels::testing::with_each_isa},
     noise::Philox,
     trajectory::Layout,
@@ -15,25 +16,28 @@ const LATENT: usize = 4;
 const LEN: usize = 8;
 const OBSERVED: usize = 10;
 
-fn config(denoiser: DenoiserConfig) -> ModelConfig {
-    ModelConfig { obs_horizon: 3, ..ModelConfig::plain(LAYOUT, Some(LatentConfig { dim: LATENT, hidden: 8 }), denoiser) }
+fn config(backbone: Backbone) -> ModelConfig {
+    let latent = GruLatent { dim: LATENT, hidden: 8, looks: Looks::Block(4), future: Future::Prior };
+    let mut config = ModelConfig::plain(LAYOUT, Some(latent), backbone);
+    config.method.plan.obs_horizon = 3;
+    config
 }
 
-fn backbones() -> [DenoiserConfig; 2] {
-    [DenoiserConfig::Unet { widths: vec![24, 40, 72] }, DenoiserConfig::Dit { width: 36, depth: 2, heads: 3 }]
+fn backbones() -> [Backbone; 2] {
+    [Backbone::Unet { widths: vec![24, 40, 72] }, Backbone::Dit { width: 36, depth: 2, heads: 3 }]
 }
 
 /// The network, jogged so that no gate is closed and no norm plain, with weights packed once.
-fn denoiser(backbone: DenoiserConfig, precision: Precision) -> Denoiser {
+fn denoiser(backbone: Backbone, precision: Precision) -> Denoiser {
     let config = config(backbone);
     let fresh = Params::fresh(1);
-    Denoiser::new(&config, &fresh).unwrap();
+    Denoiser::new(LAYOUT.dim(), &config.method, &fresh).unwrap();
     let jog = |(name, var): (String, candle_core::Var)| {
         let mut stream = Philox::named(2, &name);
         let noise: Vec<f32> = (0..var.elem_count()).map(|_| 0.1 * stream.normal()).collect();
         (name, (var.as_tensor() + Tensor::from_vec(noise, var.shape(), var.device()).unwrap()).unwrap())
     };
-    Denoiser::new(&config, &Params::loaded_as(fresh.vars().into_iter().map(jog).collect(), precision)).unwrap()
+    Denoiser::new(LAYOUT.dim(), &config.method, &Params::loaded_as(fresh.vars().into_iter().map(jog).collect(), precision)).unwrap()
 }
 
 /// Inputs of one window, drawn.
@@ -60,7 +64,7 @@ fn predict<V: Value>(denoiser: &Denoiser, windows: &[Window]) -> V {
     let (x, latents) = (join([LEN, 5], |window| &window.x), join([LEN, LATENT], |window| &window.latents));
     let observed = join([1, OBSERVED], |window| &window.observed);
     let levels: Vec<f32> = windows.iter().flat_map(|window| window.levels.iter().copied()).collect();
-    denoiser.predict(&x, &Condition { levels: &levels, latents: Some(&latents), observed: Some(&observed) }).unwrap()
+    denoiser.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: Some(&observed) }).unwrap()
 }
 
 fn bits(values: &[f32]) -> Vec<u32> {

@@ -6,13 +6,13 @@
 //! real history, the current state, and window tokens at the level the denoiser sees them ([`LatentRouting::Matched`]); the literal
 //! reading stays as a switch for the ablation.
 
-use super::{ladder::Ladder, process::Process};
+use super::{process::Process, schedule::Table};
 use crate::model::{
     Networks,
-    config::ModelConfig,
-    denoiser::Condition,
-    latent::{Gaussian, LatentModel, Tokens},
-    trajectory::Layout,
+    denoiser::Given,
+    latent::{Evidence, Gaussian, LatentModel, Tokens},
+    method::Diffusion,
+    trajectory::Seen,
 };
 use candle_core::{Device, Result, Tensor};
 use serde::{Deserialize, Serialize};
@@ -40,18 +40,31 @@ pub struct RefineOptions {
     pub sub_steps: usize,
 }
 
+/// Where a training window stands on its way down.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Standing {
+    /// In a row of the table, as the sampler sees it.
+    Row(usize),
+    /// Each position at a level of its own, whatever the schedule (diffusion forcing, Chen et al. 2024).
+    Levels(Vec<usize>),
+}
+
 /// One batch of windows, normalized units.
 pub struct WindowBatch {
     /// `(B, T_x)` tokens before the window; absent before an episode's start; rewards absent where the sampler would have imagined them.
     pub history: Tokens,
+    /// Of a GRU that runs on over the episode: how many tokens each window has before it; the history then begins at the start of the episode,
+    /// and what follows these is padding.
+    pub history_lens: Option<Vec<usize>>,
     /// `(B, T, state_dim + action_dim)` clean windows; position 0 is the current time.
     pub window: Tensor,
     /// `(B, 1, (T_o - 1) * (state_dim + action_dim))` real steps before the window for the denoiser, zeros before the start; `None` if T_o = 1.
     pub observed: Option<Tensor>,
-    /// Ladder row of each window, `0 .. sub_steps * T`.
-    pub rows: Vec<usize>,
-    /// Whether the state at position 0 is the real one (inpainted); false where the sampler would have imagined it (`action_horizon > 1`).
-    pub inpaint: Vec<bool>,
+    /// Where each window stands.
+    pub at: Vec<Standing>,
+    /// Steps right before each window that the sampler would have imagined (`action_horizon > 1`); without any the state at position 0 is
+    /// the real one, and inpainted.
+    pub imagined: Vec<usize>,
     /// `(B, T, state_dim + action_dim)` Gaussian draws.
     pub noise: Tensor,
 }
@@ -66,10 +79,11 @@ impl WindowBatch {
         let Tokens { state, action, reward, present, noise } = &self.history;
         Ok(Self {
             history: Tokens { state: cut(state)?, action: cut(action)?, reward: cut(reward)?, present: cut(present)?, noise: cut(noise)? },
+            history_lens: self.history_lens.as_ref().map(|lens| lens[start..start + len].to_vec()),
             window: cut(&self.window)?,
             observed: self.observed.as_ref().map(cut).transpose()?,
-            rows: self.rows[start..start + len].to_vec(),
-            inpaint: self.inpaint[start..start + len].to_vec(),
+            at: self.at[start..start + len].to_vec(),
+            imagined: self.imagined[start..start + len].to_vec(),
             noise: cut(&self.noise)?,
         })
     }
@@ -88,15 +102,24 @@ pub struct RefineTerms {
 /// Weight of L_prior beside L_post in the literal reading (lambda_prior of the paper).
 const LITERAL_PRIOR_WEIGHT: f64 = 0.1;
 
-/// Levels of a batch of windows, and the windows noised to them.
+/// A batch of windows, noised to their rows.
 struct Noised {
+    /// As the denoiser sees it, `(B, T, D)`.
     x: Tensor,
     /// `B * T`.
     levels: Vec<f32>,
+    /// Whether a window is at or below READY: its latents are refined.
+    ready: Vec<bool>,
+    /// What the refinement saw: where a window is below READY, the same window as it stood there.
+    refined_from: Seat,
+}
+
+/// Windows in some row each.
+#[derive(Clone)]
+struct Seat {
+    x: Tensor,
     /// `(B, T, 1)` standard deviation of the noise.
     sigma: Tensor,
-    /// Whether a window is at or below rung 1, where its latents are refined.
-    ready: Vec<bool>,
 }
 
 /// Latents of a batch, the weight of their loss, and whether each window's are refined.
@@ -111,13 +134,13 @@ impl Networks {
     ///
     /// # Errors
     /// If a shape differs from the configuration.
-    pub fn refine_loss(&self, config: &ModelConfig, batch: &WindowBatch, options: &RefineOptions) -> Result<RefineTerms> {
-        let noised = noise_windows(config, batch, options)?;
-        let weights = loss_weights(config.layout, batch, options)?;
+    pub fn refine_loss(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<RefineTerms> {
+        let noised = Noised::new(plan, batch, options)?;
+        let weights = loss_weights(batch, options)?;
         let mut loss = Tensor::new(0f32, &Device::Cpu)?;
         let (mut prior, mut posterior) = ((0.0, 0), (0.0, 0));
         for routed in self.route(batch, &noised, options.routing)? {
-            let condition = Condition { levels: &noised.levels, latents: routed.latents.as_ref(), observed: batch.observed.as_ref() };
+            let condition = Given { levels: &noised.levels, latents: routed.latents.as_ref(), observed: batch.observed.as_ref() };
             let x0 = self.denoiser.predict(&noised.x, &condition)?;
             let error = ((x0 - &batch.window)?.sqr()? * &weights)?.sum((1, 2))?;
             loss = (loss + error.mean_all()?.affine(routed.weight, 0.0)?)?;
@@ -130,12 +153,23 @@ impl Networks {
         Ok(RefineTerms { loss, prior: mean(prior), posterior: mean(posterior) })
     }
 
+    /// What the denoiser reads of a batch: x, levels, latents and real steps.
+    #[cfg(test)]
+    pub(crate) fn read_in_training(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<[Vec<f32>; 4]> {
+        let noised = Noised::new(plan, batch, options)?;
+        let latents = self.route(batch, &noised, options.routing)?.remove(0).latents;
+        let numbers = |tensor: Option<&Tensor>| tensor.map_or(Ok(Vec::new()), |tensor| tensor.flatten_all()?.to_vec1::<f32>());
+        Ok([numbers(Some(&noised.x))?, noised.levels.clone(), numbers(latents.as_ref())?, numbers(batch.observed.as_ref())?])
+    }
+
     fn route(&self, batch: &WindowBatch, noised: &Noised, routing: LatentRouting) -> Result<Vec<Routed>> {
         let count = noised.ready.len();
         let Some(latent) = &self.latent else {
             return Ok(vec![Routed { latents: None, weight: 1.0, refined: vec![false; count] }]);
         };
         let prior = || prior_latents(latent, batch);
+        // A belief that is held is not refined: there is nothing that waits for the window.
+        let routing = if latent.prior.is_some() { routing } else { LatentRouting::PriorOnly };
         Ok(match routing {
             LatentRouting::PriorOnly => vec![Routed { latents: Some(prior()?), weight: 1.0, refined: vec![false; count] }],
             LatentRouting::Matched => {
@@ -153,18 +187,24 @@ impl Networks {
     }
 }
 
+/// Posterior after the history and the tokens `ahead` of it.
+fn infer(latent: &LatentModel, batch: &WindowBatch, ahead: Tokens) -> Result<Gaussian> {
+    latent.infer_behind(&batch.history, batch.history_lens.as_deref(), &ahead)
+}
+
 /// Prior roll-out from real history and the current state: what a sampler above READY has.
 fn prior_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<Tensor> {
-    let current = window_tokens(batch, &batch.window, 0..1, [1.0, 0.0], None)?;
-    let filter = latent.infer(&batch.history.concat(&current)?)?;
+    let current = window_tokens(batch, &batch.window, Evidence::Filter.ahead(), None)?;
+    let filter = infer(latent, batch, current)?;
     chain_means(latent, filter, Vec::new(), batch.window.dim(1)?)
 }
 
 /// Posterior of position 0 from history and the noised tokens 0 and 1, and the prior chain from it: what a sampler at READY has.
 fn refined_latents(latent: &LatentModel, batch: &WindowBatch, noised: &Noised) -> Result<Tensor> {
     let len = batch.window.dim(1)?;
-    let tokens = window_tokens(batch, &noised.x, 0..len.min(2), [1.0, 1.0], Some(&noised.sigma))?;
-    let posterior = latent.infer(&batch.history.concat(&tokens)?)?;
+    let ahead = &Evidence::Refinement.ahead()[..Evidence::Refinement.ahead().len().min(len)];
+    let tokens = window_tokens(batch, &noised.refined_from.x, ahead, Some(&noised.refined_from.sigma))?;
+    let posterior = infer(latent, batch, tokens)?;
     let head = posterior.mean.clone();
     chain_means(latent, posterior, vec![head], len - 1)
 }
@@ -182,68 +222,88 @@ fn chain_means(latent: &LatentModel, start: Gaussian, head: Vec<Tensor>, len: us
 /// Posteriors of every position from the clean window itself; the last position, which has no successor, keeps the prior.
 fn teacher_forced_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<Tensor> {
     let (len, before) = (batch.window.dim(1)?, batch.history.batch_len()?.1);
-    let tokens = batch.history.concat(&window_tokens(batch, &batch.window, 0..len, [1.0, 1.0], None)?)?;
+    let tokens = batch.history.concat(&window_tokens(batch, &batch.window, &vec![Seen::GENERATED; len], None)?)?;
     let seen = tokens.narrow(1, before + len - 1)?.present;
     let posteriors = latent.posteriors(&tokens, &tokens.present, &seen)?.narrow(before, len - 1)?;
-    let last = latent.prior.predict(&posteriors.narrow(len - 2, 1)?)?;
+    let last = latent.coming(posteriors.narrow(len - 2, 1)?)?;
     Tensor::cat(&[posteriors.mean, last.mean], 1)
 }
 
-/// Positions `range` of the windows `x` as tokens: state and action as `present` says, no reward (it is not generated).
-fn window_tokens(
-    batch: &WindowBatch,
-    x: &Tensor,
-    range: std::ops::Range<usize>,
-    present: [f32; 2],
-    sigma: Option<&Tensor>,
-) -> Result<Tokens> {
-    let (rows, len) = (x.dim(0)?, range.len());
+/// The first positions of the windows `x` as tokens, of which this is seen.
+fn window_tokens(batch: &WindowBatch, x: &Tensor, seen: &[Seen], sigma: Option<&Tensor>) -> Result<Tokens> {
+    let (rows, len) = (x.dim(0)?, seen.len());
     let (state_dim, action_dim) = (batch.history.state.dim(2)?, batch.history.action.dim(2)?);
-    let part = |start, width| x.narrow(1, range.start, len)?.narrow(2, start, width)?.contiguous();
+    let flags: Vec<f32> = seen.iter().flat_map(|seen| seen.flags()).collect();
+    let present = Tensor::from_vec(flags, (1, len, 3), x.device())?.broadcast_as((rows, len, 3))?.contiguous()?;
+    let part = |start, width, index| {
+        let part = x.narrow(1, 0, len)?.narrow(2, start, width)?.contiguous()?;
+        part.broadcast_mul(&present.narrow(2, index, 1)?)
+    };
     let zeros = Tensor::zeros((rows, len, 1), x.dtype(), x.device())?;
-    let present = Tensor::new(&[present[0], present[1], 0.0], x.device())?;
     Ok(Tokens {
-        state: part(0, state_dim)?,
-        action: part(state_dim, action_dim)?,
+        state: part(0, state_dim, 0)?,
+        action: part(state_dim, action_dim, 1)?,
         reward: zeros.clone(),
-        present: present.broadcast_as((rows, len, 3))?.contiguous()?,
-        noise: sigma.map_or(Ok(zeros), |sigma| sigma.narrow(1, range.start, len)?.contiguous())?,
+        noise: sigma.map_or(Ok(zeros), |sigma| sigma.narrow(1, 0, len)?.contiguous())?,
+        present,
     })
 }
 
-/// q_sample at each window's ladder row; the state at position 0 is the real one where it is inpainted.
-fn noise_windows(config: &ModelConfig, batch: &WindowBatch, options: &RefineOptions) -> Result<Noised> {
-    let (count, len, dim) = batch.window.dims3()?;
-    let ladder = Ladder::new(config.plan_horizon, options.sub_steps, config.level_max).map_err(candle_core::Error::Msg)?;
-    let process = Process::cosine(config.level_max);
-    let levels: Vec<usize> = batch.rows.iter().flat_map(|row| ladder.row(*row)).collect();
+impl Noised {
+    fn new(plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<Self> {
+        let table = Table::new(plan.schedule, plan.horizon, options.sub_steps, plan.level_max).map_err(candle_core::Error::Msg)?;
+        let process = Process::cosine(plan.level_max);
+        // Rows below READY; none for a window above it.
+        let below_ready = |standing: &Standing| match (standing, table.ready()) {
+            (Standing::Row(row), Some(ready)) => row.checked_sub(ready),
+            (Standing::Row(_) | Standing::Levels(_), _) => None,
+        };
+        let at = |above: &dyn Fn(&Standing) -> usize| {
+            let levels = |standing: &Standing| match standing {
+                Standing::Row(row) => table.row(row - above(standing)),
+                Standing::Levels(levels) => levels.clone(),
+            };
+            let levels: Vec<usize> = batch.at.iter().flat_map(levels).collect();
+            Ok::<_, candle_core::Error>((q_sample(batch, &process, &levels)?, levels))
+        };
+        let (seat, levels) = at(&|_| 0)?;
+        // The sampler refines once a rung, at READY, and walks the rest of it with that latent.
+        let rows_below = |standing: &Standing| below_ready(standing).unwrap_or(0);
+        let refined_from = if batch.at.iter().any(|standing| rows_below(standing) > 0) { at(&rows_below)?.0 } else { seat.clone() };
+        let levels = levels.iter().map(|level| *level as f32).collect();
+        let ready = batch.at.iter().map(|standing| below_ready(standing).is_some()).collect();
+        Ok(Self { x: seat.x, levels, ready, refined_from })
+    }
+}
+
+/// q_sample at these levels, `B * T`; the state at position 0 is the real one where it is inpainted.
+fn q_sample(batch: &WindowBatch, process: &Process, levels: &[usize]) -> Result<Seat> {
+    let ((count, len, dim), state_dim) = (batch.window.dims3()?, batch.history.state.dim(2)?);
     let mut coefficients = [Vec::with_capacity(count * len * dim), Vec::with_capacity(count * len * dim)];
     for (index, level) in levels.iter().enumerate() {
         let (signal, noise) = process.q_sample(*level);
-        let inpainted = index % len == 0 && batch.inpaint[index / len];
+        let inpainted = index % len == 0 && batch.imagined[index / len] == 0;
         for column in 0..dim {
-            let kept = inpainted && column < config.layout.state_dim;
+            let kept = inpainted && column < state_dim;
             coefficients[0].push(if kept { 1.0 } else { signal });
             coefficients[1].push(if kept { 0.0 } else { noise });
         }
     }
     let [signal, noise] = coefficients;
     let tensor = |values| Tensor::from_vec(values, (count, len, dim), &Device::Cpu);
-    Ok(Noised {
+    Ok(Seat {
         x: ((tensor(signal)? * &batch.window)? + (tensor(noise)? * &batch.noise)?)?,
-        levels: levels.iter().map(|level| *level as f32).collect(),
         sigma: Tensor::from_vec(levels.iter().map(|level| process.sigma(*level)).collect::<Vec<_>>(), (count, len, 1), &Device::Cpu)?,
-        ready: batch.rows.iter().map(|row| *row >= ladder.ready()).collect(),
     })
 }
 
 /// `(B, T, D)`: 1 for each entry, more for the first action, 0 for what is inpainted; each window's weights sum to 1.
-fn loss_weights(layout: Layout, batch: &WindowBatch, options: &RefineOptions) -> Result<Tensor> {
-    let (count, len, dim) = batch.window.dims3()?;
+fn loss_weights(batch: &WindowBatch, options: &RefineOptions) -> Result<Tensor> {
+    let ((count, len, dim), state_dim) = (batch.window.dims3()?, batch.history.state.dim(2)?);
     let mut weights = Vec::with_capacity(count * len * dim);
     for row in 0..count {
-        let at = |position: usize, column: usize| match (position, column < layout.state_dim) {
-            (0, true) => f32::from(!batch.inpaint[row]),
+        let at = |position: usize, column: usize| match (position, column < state_dim) {
+            (0, true) => f32::from(batch.imagined[row] > 0),
             (0, false) => options.first_action_weight,
             _ => 1.0,
         };

@@ -1,7 +1,15 @@
 //! The leak, held shut: training latents depend on nothing that the sampler does not have.
 
 use super::*;
-use crate::model::{denoiser::DenoiserConfig, latent::LatentConfig, nn::params::Params, noise::Philox, trajectory::Token};
+use crate::model::{
+    config::ModelConfig,
+    method::{Backbone, Future, GruLatent, Looks},
+    method::{LatentSource, Schedule},
+    nn::params::Params,
+    noise::Philox,
+    trajectory::Layout,
+    trajectory::Token,
+};
 
 const BATCH: usize = 6;
 const LEN: usize = 4;
@@ -10,9 +18,10 @@ const STATE: usize = 3;
 
 fn config() -> ModelConfig {
     let layout = Layout { state_dim: STATE, action_dim: DIM - STATE };
-    let denoiser = DenoiserConfig::Dit { width: 16, depth: 1, heads: 2 };
-    let plain = ModelConfig::plain(layout, Some(LatentConfig { dim: 4, hidden: 8 }), denoiser);
-    ModelConfig { plan_horizon: LEN, block_len: 3, level_max: 20, ..plain }
+    let latent = GruLatent { dim: 4, hidden: 8, looks: Looks::Block(3), future: Future::Prior };
+    let mut config = ModelConfig::plain(layout, Some(latent), Backbone::Dit { width: 16, depth: 1, heads: 2 });
+    (config.method.plan.horizon, config.method.plan.level_max) = (LEN, 20);
+    config
 }
 
 fn options(routing: LatentRouting) -> RefineOptions {
@@ -35,17 +44,18 @@ fn batch(window: Vec<f32>, noise: Vec<f32>, row: usize) -> WindowBatch {
     let tensor = |values| Tensor::from_vec(values, (BATCH, LEN, DIM), &Device::Cpu).unwrap();
     WindowBatch {
         history: Tokens::pack(config().layout, history.iter(), 3, |row, position| row[position].view()).unwrap(),
+        history_lens: None,
         window: tensor(window),
         observed: None,
-        rows: vec![row; BATCH],
-        inpaint: vec![true; BATCH],
+        at: vec![Standing::Row(row); BATCH],
+        imagined: vec![0; BATCH],
         noise: tensor(noise),
     }
 }
 
 /// The latents of the first (or only) routing of a batch.
 fn latents(networks: &Networks, batch: &WindowBatch, routing: LatentRouting) -> Vec<f32> {
-    let noised = noise_windows(&config(), batch, &options(routing)).unwrap();
+    let noised = Noised::new(&config().method.plan, batch, &options(routing)).unwrap();
     let routed = networks.route(batch, &noised, routing).unwrap().remove(0);
     routed.latents.unwrap().flatten_all().unwrap().to_vec1().unwrap()
 }
@@ -53,7 +63,7 @@ fn latents(networks: &Networks, batch: &WindowBatch, routing: LatentRouting) -> 
 /// Another clean window with the same current state, and noise chosen so that at `row` the first `kept` positions look the same.
 fn perturbed(window: &[f32], noise: &[f32], row: usize, kept: usize) -> (Vec<f32>, Vec<f32>) {
     let (other, process) = (values(77), Process::cosine(20));
-    let levels = Ladder::new(LEN, 1, 20).unwrap().row(row);
+    let levels = Table::new(Schedule::Ladder, LEN, 1, 20).unwrap().row(row);
     let (mut window, mut noise) = (window.to_vec(), noise.to_vec());
     for index in 0..window.len() {
         let (position, column) = (index / DIM % LEN, index % DIM);
@@ -71,7 +81,7 @@ fn perturbed(window: &[f32], noise: &[f32], row: usize, kept: usize) -> (Vec<f32
 
 #[test]
 fn matched_latents_see_only_what_the_sampler_has() {
-    let networks = Networks::new(&config(), &Params::fresh(1)).unwrap();
+    let networks = Networks::new(config().layout, &config().method, &Params::fresh(1)).unwrap();
     let (window, noise) = (values(1), values(2));
     for row in 0..LEN {
         // Above READY the window is unseen; at READY its first two positions are seen as noised.
@@ -91,7 +101,7 @@ fn matched_latents_see_only_what_the_sampler_has() {
 /// At READY the refined latent does look at the noised positions 0 and 1: the zig-zag has something to work on.
 #[test]
 fn refined_latents_see_the_noised_positions() {
-    let networks = Networks::new(&config(), &Params::fresh(1)).unwrap();
+    let networks = Networks::new(config().layout, &config().method, &Params::fresh(1)).unwrap();
     let at = |row, noise| latents(&networks, &batch(values(1), noise, row), LatentRouting::Matched);
     assert_ne!(at(LEN - 1, values(2)), at(LEN - 1, values(3)));
     assert_eq!(at(0, values(2)), at(0, values(3)));
@@ -101,12 +111,12 @@ fn refined_latents_see_the_noised_positions() {
 #[test]
 fn loss_is_the_weighted_mean_square() {
     let mut config = config();
-    config.latent = None;
-    let networks = Networks::new(&config, &Params::fresh(1)).unwrap();
+    config.method.latent = LatentSource::None;
+    let networks = Networks::new(config.layout, &config.method, &Params::fresh(1)).unwrap();
     let batch = batch(values(1), values(2), 2);
     let options = options(LatentRouting::Matched);
-    let noised = noise_windows(&config, &batch, &options).unwrap();
-    let condition = Condition { levels: &noised.levels, latents: None, observed: None };
+    let noised = Noised::new(&config.method.plan, &batch, &options).unwrap();
+    let condition = Given { levels: &noised.levels, latents: None, observed: None };
     let x0: Vec<f32> = networks.denoiser.predict(&noised.x, &condition).unwrap().flatten_all().unwrap().to_vec1().unwrap();
     let (mut sum, mut weight) = (0.0, 0.0);
     for (index, (x0, clean)) in x0.iter().zip(values(1)).enumerate() {
@@ -118,7 +128,7 @@ fn loss_is_the_weighted_mean_square() {
         sum += w * (x0 - clean).powi(2);
         weight += w;
     }
-    let terms = networks.refine_loss(&config, &batch, &options).unwrap();
+    let terms = networks.refine_loss(&config.method.plan, &batch, &options).unwrap();
     let loss: f32 = terms.loss.to_scalar().unwrap();
     assert!((loss - sum / weight).abs() < 1e-4 * loss, "{loss} against {}", sum / weight);
     assert_eq!((terms.prior.1, terms.posterior.1), (BATCH, 0));
@@ -128,9 +138,10 @@ fn loss_is_the_weighted_mean_square() {
 #[test]
 fn gradients_reach_latents_and_denoiser() {
     let params = Params::fresh(1);
-    let networks = Networks::new(&config(), &params).unwrap();
+    let networks = Networks::new(config().layout, &config().method, &params).unwrap();
     let reached = |row| {
-        let terms = networks.refine_loss(&config(), &batch(values(1), values(2), row), &options(LatentRouting::Matched)).unwrap();
+        let terms =
+            networks.refine_loss(&config().method.plan, &batch(values(1), values(2), row), &options(LatentRouting::Matched)).unwrap();
         let grads = terms.loss.backward().unwrap();
         let reached = params
             .vars()

@@ -1,7 +1,8 @@
 //! The loss of stage 1: evidence lower bound over a block (equation of section 4.2; appendix A.4).
 
 use super::{Gaussian, LatentModel, Tokens};
-use candle_core::{Result, Tensor};
+use crate::model::trajectory::Seen;
+use candle_core::{Device, Result, Tensor};
 
 /// One batch of blocks.
 pub struct ElboBatch {
@@ -78,31 +79,57 @@ impl LatentModel {
     /// If shapes differ.
     pub fn elbo(&self, batch: &ElboBatch, options: &ElboOptions) -> Result<ElboTerms> {
         let (_, len) = batch.tokens.batch_len()?;
-        let q = self.posteriors(&batch.tokens, &batch.history_shown, &batch.successor_shown)?;
-        let latent = q.sample(&batch.eps)?;
-        let (now, next) = (batch.tokens.narrow(0, len - 1)?, batch.tokens.narrow(1, len - 1)?);
+        let Explained { q, from } = self.explained(batch)?;
+        let (steps, valid) = (len - 1 - from, batch.valid.narrow(1, from, len - 1 - from)?);
+        let latent = q.sample(&batch.eps.narrow(1, from, steps)?)?;
+        let (now, next) = (batch.tokens.narrow(from, steps)?, batch.tokens.narrow(from + 1, steps)?);
         let (change, reward) = self.decoder.predict(&now.state, &now.action, &latent)?;
         let std = Tensor::new(options.state_change_std.as_slice(), change.device())?;
         let target = (&next.state - &now.state)?.broadcast_div(&std)?;
-        let count = batch.valid.sum_all()?;
+        let count = valid.sum_all()?;
         let column_error = |residual: Tensor| -> Result<Tensor> {
-            residual.sqr()?.broadcast_mul(&batch.valid.unsqueeze(2)?)?.sum((0, 1))?.broadcast_div(&count)
+            residual.sqr()?.broadcast_mul(&valid.unsqueeze(2)?)?.sum((0, 1))?.broadcast_div(&count)
         };
         let (state_error, reward_error) = (column_error((change - target)?)?, column_error((reward - &now.reward)?)?);
         let (state_error, reward_error) = (state_error.mean_all()?, reward_error.mean_all()?);
-        let kl = self.block_kl(&q, &batch.valid)?;
+        let kl = self.block_kl(&q, &valid)?;
         let rec = (&state_error + reward_error.affine(options.reward_weight, 0.0)?)?;
         let loss = (rec + kl.affine(options.kl_weight, 0.0)?)?;
         Ok(ElboTerms { loss, state_error, reward_error, kl })
     }
 
+    /// The latents that explain the steps of a block, and the first step that has one: c_t of a model with a prior waits for what is shown of
+    /// x_{t+1}, from the first step on; a belief that is held is all that is known before the step, from the second step on.
+    fn explained(&self, batch: &ElboBatch) -> Result<Explained> {
+        if self.prior.is_some() {
+            return Ok(Explained { q: self.posteriors(&batch.tokens, &batch.history_shown, &batch.successor_shown)?, from: 0 });
+        }
+        let state = Tensor::new(&Seen::STATE.flags(), &Device::Cpu)?;
+        let shown = state.broadcast_as(batch.successor_shown.shape())?.contiguous()?;
+        let beliefs = self.posteriors(&batch.tokens, &batch.history_shown, &shown)?;
+        let steps = beliefs.mean.dim(1)? - 1;
+        Ok(Explained { q: beliefs.narrow(0, steps)?, from: 1 })
+    }
+
+    /// KL to the prior of each step but the first, or of a held belief to N(0, I).
     fn block_kl(&self, q: &Gaussian, valid: &Tensor) -> Result<Tensor> {
+        let Some(prior) = &self.prior else {
+            let standard = Gaussian { mean: q.mean.zeros_like()?, log_var: q.mean.zeros_like()? };
+            return (q.kl(&standard)? * valid)?.sum_all()? / valid.sum_all()?;
+        };
         let steps = q.mean.dim(1)?;
-        let prior = self.prior.predict(&q.narrow(0, steps - 1)?)?;
+        let prior = prior.predict(&q.narrow(0, steps - 1)?)?;
         let valid = valid.narrow(1, 1, steps - 1)?;
         let kl = (q.narrow(1, steps - 1)?.kl(&prior)? * &valid)?.sum_all()?;
         kl / valid.sum_all()?
     }
+}
+
+/// See [`LatentModel::explained`].
+struct Explained {
+    /// `(B, L - 1 - from, dim)`.
+    q: Gaussian,
+    from: usize,
 }
 
 #[cfg(test)]

@@ -1,7 +1,8 @@
 //! Tokens to posterior: embeddings, GRU and Gaussian head (appendix A.4 of the paper: Stage 1 networks).
 
-use super::{Gaussian, LatentConfig, Tokens};
+use super::{Gaussian, Tokens};
 use crate::model::{
+    method::GruLatent,
     nn::{
         Activation::Relu,
         Gru, Linear, Value,
@@ -47,7 +48,7 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    pub(super) fn new(config: &LatentConfig, layout: Layout, params: &Params) -> Result<Self> {
+    pub(super) fn new(config: &GruLatent, layout: Layout, params: &Params) -> Result<Self> {
         let width = STATE_WIDTH + ACTION_WIDTH + REWARD_WIDTH + 1;
         Ok(Self {
             state: Part::new(layout.state_dim, STATE_WIDTH, &params.scope("state"))?,

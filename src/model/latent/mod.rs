@@ -1,31 +1,23 @@
 //! Stage 1: what cannot be seen, inferred from a block of tokens (section 4.2 of the paper).
 pub mod elbo;
 mod encoder;
+mod evidence;
 mod gaussian;
 mod heads;
 mod tokens;
 
 pub use encoder::Encoder;
+pub use evidence::Evidence;
 pub use gaussian::{Gaussian, GaussianRef, hold_within};
 pub use heads::{Decoder, Prior};
 pub use tokens::Tokens;
 
 use crate::model::{
+    method::{Future, GruLatent},
     nn::{Value, params::Params},
     trajectory::Layout,
 };
-use candle_core::Result;
-use serde::{Deserialize, Serialize};
-
-/// Sizes of the latent model.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct LatentConfig {
-    /// Width of the latent (d_c).
-    pub dim: usize,
-    /// Hidden size of the GRU.
-    pub hidden: usize,
-}
+use candle_core::{Result, Tensor};
 
 /// Encoder with posterior head, prior and decoder.
 ///
@@ -34,8 +26,8 @@ pub struct LatentConfig {
 pub struct LatentModel {
     /// Tokens to posterior.
     pub encoder: Encoder,
-    /// p(c_t given the distribution of c_{t-1}).
-    pub prior: Prior,
+    /// p(c_t given the distribution of c_{t-1}); none where the belief of now is held.
+    pub prior: Option<Prior>,
     /// p(s_{t+1}, r_t given s_t, a_t, c_t).
     pub decoder: Decoder,
 }
@@ -45,35 +37,84 @@ impl LatentModel {
     ///
     /// # Errors
     /// If a loaded parameter is missing or of another shape.
-    pub fn new(config: &LatentConfig, layout: Layout, params: &Params) -> Result<Self> {
+    pub fn new(config: &GruLatent, layout: Layout, params: &Params) -> Result<Self> {
         Ok(Self {
             encoder: Encoder::new(config, layout, &params.scope("encoder"))?,
-            prior: Prior::new(config.dim, &params.scope("prior"))?,
+            prior: match config.future {
+                Future::Prior => Some(Prior::new(config.dim, &params.scope("prior"))?),
+                Future::Held => None,
+            },
             decoder: Decoder::new(config.dim, layout, &params.scope("decoder"))?,
         })
     }
 
-    /// Posterior after the last token of each block: `(B, L)` tokens to a Gaussian of `(B, 1, dim)`.
+    /// Posterior after the last token of each block: `(B, L)` tokens to a Gaussian of `(B, 1, dim)`. The GRU goes on from the state `before`,
+    /// `(B, 1, hidden)`, or begins at zero.
     ///
     /// # Errors
     /// If widths differ from the layout.
-    pub fn infer<V: Value>(&self, block: &Tokens<V>) -> Result<Gaussian<V>> {
-        let (_, len) = block.batch_len()?;
-        self.encoder.posterior(&self.encoder.states(block, None)?.step(len - 1)?)
+    pub fn infer<V: Value>(&self, block: &Tokens<V>, before: Option<&V>) -> Result<Gaussian<V>> {
+        self.encoder.posterior(&self.read(block, before)?)
     }
 
-    /// The prior chain: the Gaussians of c_tau, c_{tau+1}, ..., each the prior's answer to the one before (section 4.2; the prior's input
-    /// is the pair mean, log-variance). `start` is the distribution of c_{tau-1}; `each` gets `len` Gaussians of `(B, 1, dim)`.
+    /// The same from a history and the tokens `ahead` of it: one block, or, where a GRU runs on and the history says how many tokens each row
+    /// has, from its state there.
+    ///
+    /// # Errors
+    /// As [`Self::infer`].
+    pub fn infer_behind(&self, history: &Tokens, lens: Option<&[usize]>, ahead: &Tokens) -> Result<Gaussian> {
+        match lens {
+            None => self.infer(&history.concat(ahead)?, None),
+            Some(lens) => self.infer(ahead, Some(&self.read_to(history, lens)?)),
+        }
+    }
+
+    /// State of the GRU after the last token, `(B, 1, hidden)`.
+    ///
+    /// # Errors
+    /// If widths differ from the layout, or there is no token.
+    pub fn read<V: Value>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
+        let (_, len) = tokens.batch_len()?;
+        self.encoder.states(tokens, before)?.step(len.saturating_sub(1))
+    }
+
+    /// State of the GRU after the first `lens[b]` tokens of row b, `(B, 1, hidden)`; zero after none.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn read_to(&self, tokens: &Tokens, lens: &[usize]) -> Result<Tensor> {
+        let (batch, len) = tokens.batch_len()?;
+        let states = self.encoder.states(tokens, None)?;
+        let last: Vec<f32> = lens.iter().flat_map(|end| (1..=len).map(move |steps| f32::from(steps == *end))).collect();
+        Tensor::from_vec(last, (batch, 1, len), states.device())?.matmul(&states)
+    }
+
+    /// The latents of a window, c_tau, c_{tau+1}, ..: by the prior, each its answer to the one before (section 4.2; its input is the pair
+    /// mean, log-variance), or the belief of now held. `start` is what [`Self::infer`] says after s_tau: with a prior the distribution of
+    /// c_{tau-1}, held that of c_tau itself. `each` gets `len` Gaussians of `(B, 1, dim)`.
     ///
     /// # Errors
     /// If widths differ, or `each` fails.
     pub fn roll_out<V: Value>(&self, start: Gaussian<V>, len: usize, mut each: impl FnMut(&Gaussian<V>) -> Result<()>) -> Result<()> {
         let mut now = start;
         for _ in 0..len {
-            now = self.prior.predict(&now)?;
+            if let Some(prior) = &self.prior {
+                now = prior.predict(&now)?;
+            }
             each(&now)?;
         }
         Ok(())
+    }
+
+    /// The latent of the coming step: the first of [`Self::roll_out`].
+    ///
+    /// # Errors
+    /// If widths differ.
+    pub fn coming<V: Value>(&self, start: Gaussian<V>) -> Result<Gaussian<V>> {
+        match &self.prior {
+            Some(prior) => prior.predict(&start),
+            None => Ok(start),
+        }
     }
 }
 

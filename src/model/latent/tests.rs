@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::model::{
+    method::{Future, GruLatent, Looks},
     nn::{Buffer, Precision},
     noise::Philox,
     trajectory::Token,
@@ -12,7 +13,7 @@ const LAYOUT: Layout = Layout { state_dim: 3, action_dim: 2 };
 const LEN: usize = 5;
 
 fn model() -> LatentModel {
-    let (config, fresh) = (LatentConfig { dim: 6, hidden: 24 }, Params::fresh(4));
+    let (config, fresh) = (GruLatent { dim: 6, hidden: 24, looks: Looks::Block(4), future: Future::Prior }, Params::fresh(4));
     LatentModel::new(&config, LAYOUT, &fresh).unwrap();
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
     LatentModel::new(&config, LAYOUT, &Params::loaded_as(tensors, Precision::F32)).unwrap()
@@ -33,7 +34,7 @@ fn rows() -> Vec<Vec<Token>> {
 /// Posterior, and mean and log-variance of the prior chain after it.
 fn chain<V: Value>(model: &LatentModel, rows: &[Vec<Token>], numbers: impl Fn(&V) -> Vec<f32>) -> Vec<u32> {
     let tokens = Tokens::<V>::pack(LAYOUT, rows.iter(), LEN, |row, position| row[position].view()).unwrap();
-    let posterior = model.infer(&tokens).unwrap();
+    let posterior = model.infer(&tokens, None).unwrap();
     let mut all = [numbers(&posterior.mean), numbers(&posterior.log_var)].concat();
     let keep = |next: &Gaussian<V>| {
         all.extend([numbers(&next.mean), numbers(&next.log_var)].concat());

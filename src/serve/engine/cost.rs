@@ -1,13 +1,13 @@
 //! What a tick costs: measured at warm-up for every batch length, so that an act with a deadline can be told how many it may still take.
 
-use crate::model::agent::{Agent, AgentError, Descent, Observation};
+use crate::model::agent::{Act, Agent, AgentError, Observation};
 use parking_lot::RwLock;
 use std::{
     sync::{Arc, Weak},
     time::{Duration, Instant},
 };
 
-/// Descents of each length that are timed, and their ticks; the fastest counts, for the first ones find no memory yet.
+/// Acts of each length that are timed, and their ticks; the fastest counts, for the first ones find no memory yet.
 const ROUNDS: usize = 3;
 /// A tick that takes this long is timed once: its memory is the least of it, and a large model must get ready in time too.
 const LONG: Duration = Duration::from_millis(20);
@@ -37,7 +37,7 @@ impl Tariff {
 /// Costs of one model on one worker.
 #[derive(Debug)]
 pub(super) struct Costs {
-    /// A tick of descents on their way, by batch length from 1.
+    /// A tick of acts on their way, by batch length from 1.
     ticks: Vec<Duration>,
     /// What the first tick costs more: latents and their prior chain.
     starts: Vec<Duration>,
@@ -50,13 +50,13 @@ impl Costs {
         for len in (1..=len_max).take_while(|_| go_on()) {
             let (mut tick, mut start) = (Duration::MAX, Duration::MAX);
             for _ in 0..ROUNDS {
-                let mut descents = descents(agent, len)?;
-                start = start.min(timed(|| agent.advance(&mut descents))?);
+                let mut acts = acts(agent, len)?;
+                start = start.min(timed(|| agent.advance(&mut acts))?);
                 // One that is done after a single evaluation has failed, or is a whole act.
-                let done = descents.extract_if(.., |descent| descent.is_done());
-                done.map(|descent| agent.finish(descent)).try_for_each(|acted| acted.map(drop))?;
+                let done = acts.extract_if(.., |act| act.is_done());
+                done.map(|act| agent.finish(act)).try_for_each(|acted| acted.map(drop))?;
                 // Where one evaluation makes a whole act, every tick is a first one.
-                tick = if descents.len() == len { tick.min(timed(|| agent.advance(&mut descents))?) } else { start };
+                tick = if acts.len() == len { tick.min(timed(|| agent.advance(&mut acts))?) } else { start };
                 if tick > LONG {
                     break;
                 }
@@ -67,7 +67,7 @@ impl Costs {
         Ok(costs)
     }
 
-    /// A tick of `len` descents, with the start of `fresh` among them.
+    /// A tick of `len` acts, with the start of `fresh` among them.
     pub fn tick(&self, len: usize, fresh: usize) -> Duration {
         of(&self.ticks, len) + if fresh > 0 { of(&self.starts, fresh) } else { Duration::ZERO }
     }
@@ -83,7 +83,7 @@ impl Costs {
         self.act(evaluations, len) / len as u32
     }
 
-    /// Ticks of `len` descents that fit into `left` for one that has started or not, if each waits for `others` too and everything takes
+    /// Ticks of `len` acts that fit into `left` for one that has started or not, if each waits for `others` too and everything takes
     /// `slowness` times as long as it did at warm-up.
     pub fn ticks_within(&self, left: Duration, (len, started): (usize, bool), others: Duration, slowness: f64) -> usize {
         let start = if started { Duration::ZERO } else { of(&self.starts, len) };
@@ -134,8 +134,8 @@ fn timed(work: impl FnOnce() -> Result<(), AgentError>) -> Result<Duration, Agen
 }
 
 /// First acts of as many sessions, within what the model knows: one standard deviation off the mean.
-fn descents(agent: &Agent, len: usize) -> Result<Vec<Descent>, AgentError> {
-    let known = &agent.config().normalizer.state;
+fn acts(agent: &Agent, len: usize) -> Result<Vec<Act>, AgentError> {
+    let known = &agent.config().units.normalizer.state;
     let observation = Observation { state: known.denormalize(&vec![1.0; known.mean.len()]), ..Observation::default() };
     let begin = |seed| agent.begin(&agent.open(seed, &agent.spec().sampler)?, &observation);
     (0..len as u64).map(begin).collect()

@@ -12,7 +12,7 @@ mod tick;
 mod turns;
 mod worker;
 
-use crate::model::agent::{Agent, AgentError, Chunk, Descent, Episode, Observation};
+use crate::model::agent::{Act, Agent, AgentError, Chunk, Episode, Observation};
 use cost::Tariff;
 use parking_lot::Mutex;
 use queue::{Ask, Bounds, Place, Queue};
@@ -70,7 +70,7 @@ impl Question {
     ///
     /// # Errors
     /// If the observation does not fit the model.
-    pub fn begin(&self, agent: &Agent) -> Result<Descent, AgentError> {
+    pub fn begin(&self, agent: &Agent) -> Result<Act, AgentError> {
         agent.begin(&self.episode, &self.observation)
     }
 }
@@ -82,7 +82,7 @@ pub struct Job<T> {
     /// To begin again, should the batch fail.
     pub question: Question,
     /// The act, begun.
-    pub descent: Descent,
+    pub act: Act,
     /// Who waits.
     pub ticket: T,
     /// When it was submitted.
@@ -273,11 +273,11 @@ impl<T: Ticket> Drop for Engine<T> {
 impl<T: Ticket> Shared<T> {
     /// What an act asks of the queue; None: it would come too late without any wait. Of a model that was never measured nothing is known.
     fn ask(&self, job: &Job<T>) -> Option<Ask> {
-        let bytes = size_of::<Job<T>>() + job.question.observation.size_bytes() + job.descent.size_bytes();
+        let bytes = size_of::<Job<T>>() + job.question.observation.size_bytes() + job.act.size_bytes();
         let ask =
             Ask { turn_by: job.turn_by, client: job.client, work: Duration::ZERO, bytes, wait_max: Duration::MAX, useful: Duration::MAX };
         let Some(costs) = self.tariff.of(&job.agent) else { return Some(ask) };
-        let (evaluations, patience) = (job.descent.evaluations_left(), job.ticket.patience());
+        let (evaluations, patience) = (job.act.evaluations_left(), job.ticket.patience());
         let ((waiting, running), slowness) = (self.queue.load(), self.queue.slowness());
         let batch = ((waiting + running) / self.options.workers + 1).min(self.options.batch_len_max);
         // One that may be degraded needs time for a single evaluation.

@@ -3,8 +3,9 @@
 use super::pb;
 use crate::{
     model::{
-        agent::{Chunk, Executed, LatentMode, Observation, SamplerOptions, Spec, Start},
+        agent::{Chunk, Executed, Observation, Spec, Start},
         config::{Missing, Trained},
+        options::{LatentMode, SamplerOptions},
     },
     serve::{
         error::ServiceError,
@@ -193,20 +194,8 @@ fn sampler_options(options: &SamplerOptions) -> pb::SamplerOptions {
 
 pub fn model(model: &Model) -> pb::Model {
     let Model { name, agent, is_default } = model;
-    let Spec {
-        layout,
-        plan_horizon,
-        block_len,
-        obs_horizon,
-        latent_dim,
-        level_max,
-        action_low,
-        action_high,
-        sampler,
-        refined,
-        trained,
-        digest,
-    } = agent.spec();
+    let Spec { layout, plan_horizon, block_len, obs_horizon, latent_dim, level_max, action_low, action_high, sampler, trained, digest } =
+        agent.spec();
     pb::Model {
         name: name.to_string(),
         digest: digest.clone(),
@@ -221,13 +210,13 @@ pub fn model(model: &Model) -> pb::Model {
         action_low: action_low.clone(),
         action_high: action_high.clone(),
         sampler: Some(sampler_options(sampler)),
-        refined: *refined,
+        refined: trained.refined,
         trained: Some(self::trained(trained)),
     }
 }
 
 fn trained(trained: &Trained) -> pb::Trained {
-    let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward } } = trained;
+    let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward }, refined: _ } = trained;
     let lengths = |lengths: &[usize]| lengths.iter().map(|length| *length as u32).collect();
     pb::Trained {
         action_horizons: lengths(action_horizons),

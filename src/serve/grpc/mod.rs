@@ -14,8 +14,8 @@ pub mod pb {
 
 use crate::serve::{
     error::{ServiceError, Stage},
+    gate::Gate,
     idle::Idle,
-    listener::Gate,
     request::{ActResult, Opened},
     service::Service,
 };

@@ -222,7 +222,7 @@ pub struct MissingAnswer {
 
 impl From<Trained> for TrainedAnswer {
     fn from(trained: Trained) -> Self {
-        let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward } } = trained;
+        let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward }, refined: _ } = trained;
         Self { action_horizons, sub_steps, missing: MissingAnswer { state, action, reward } }
     }
 }
@@ -230,20 +230,8 @@ impl From<Trained> for TrainedAnswer {
 impl From<&Model> for ModelAnswer {
     fn from(model: &Model) -> Self {
         let Model { name, agent, is_default } = model;
-        let Spec {
-            layout,
-            plan_horizon,
-            block_len,
-            obs_horizon,
-            latent_dim,
-            level_max,
-            action_low,
-            action_high,
-            sampler,
-            refined,
-            trained,
-            digest,
-        } = agent.spec().clone();
+        let Spec { layout, plan_horizon, block_len, obs_horizon, latent_dim, level_max, action_low, action_high, sampler, trained, digest } =
+            agent.spec().clone();
         Self {
             name: name.to_string(),
             digest,
@@ -258,7 +246,7 @@ impl From<&Model> for ModelAnswer {
             action_low,
             action_high,
             sampler: (&sampler).into(),
-            refined,
+            refined: trained.refined,
             trained: trained.into(),
         }
     }

@@ -1,7 +1,10 @@
 //! Bodies that clients send: the protos' requests under the same names.
 
 use crate::{
-    model::agent::{Executed, LatentMode, Observation, SamplerOptions},
+    model::{
+        agent::{Executed, Observation},
+        options::{LatentMode, SamplerOptions},
+    },
     serve::request::{ActRequest, Caller, Face, OpenRequest, OptionsPatch, ResetRequest},
 };
 use serde::{Deserialize, Deserializer, Serialize, de};

@@ -8,7 +8,7 @@ mod routes;
 mod stream;
 mod strict;
 
-pub use crate::serve::listener::Gate;
+pub use crate::serve::gate::Gate;
 pub use problem::Problem;
 pub use routes::{openapi, router};
 

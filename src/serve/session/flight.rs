@@ -170,7 +170,7 @@ mod tests {
     #[test]
     fn a_deadline_at_the_commit_is_told_the_truth() {
         let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
-        let (options, ttl, request_id) = (agent.config().sampler.clone(), Duration::from_secs(60), String::new());
+        let (options, ttl, request_id) = (agent.config().defaults.sampler.clone(), Duration::from_secs(60), String::new());
         let episode = agent.open(1, &options).unwrap();
         let seen = Observation { state: vec![0.1; 4], ..Observation::default() };
         let (after, chunk) = agent.act(&episode, &seen).unwrap();

@@ -13,7 +13,10 @@ pub use table::Sessions;
 pub use untold::Untold;
 
 use crate::{
-    model::agent::{Agent, Chunk, Episode, SamplerOptions},
+    model::{
+        agent::{Agent, Chunk, Episode},
+        options::SamplerOptions,
+    },
     serve::{engine::Patience, error::ServiceError},
 };
 use parking_lot::Mutex;

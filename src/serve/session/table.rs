@@ -349,7 +349,7 @@ mod tests {
     fn table(len_max: usize) -> (Sessions, impl Fn() -> Opening) {
         let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
         let opening = move || {
-            let (options, ttl) = (agent.config().sampler.clone(), 60 * MINUTE);
+            let (options, ttl) = (agent.config().defaults.sampler.clone(), 60 * MINUTE);
             let episode = agent.open(1, &options).unwrap();
             Opening { model: "tiny".into(), agent: agent.clone(), episode, options, ttl, request_id: String::new() }
         };

@@ -3,8 +3,7 @@
 //! A network that always saw rewards takes their absence for news: on Point-Wind-S a policy trained with whole histories fell from -21.1
 //! to -44.7 when its client reported none, though the reward says nothing there.
 
-use super::window::Seen;
-use crate::model::{config::Missing, noise::Philox};
+use crate::model::{config::Missing, noise::Philox, trajectory::Seen};
 use serde::{Deserialize, Serialize};
 
 /// The recipe's `[hide]`: how often a field of the history is hidden, in the blocks of stage 1 and the windows of stage 2.

@@ -9,7 +9,7 @@ pub mod window;
 use units::{ActionColumn, ActionsConfig};
 
 use crate::model::{
-    config::ModelConfig,
+    config::Units,
     noise::Philox,
     normalizer::{Affine, Normalizer},
     trajectory::Layout,
@@ -22,6 +22,9 @@ use std::{io, ops::Range, sync::Arc};
 const HELD_OUT_EVERY: usize = 10;
 /// Seed of the split: the same for all training seeds, so that their held-out numbers can be compared.
 const SPLIT_SEED: u64 = 0x5EED;
+
+/// Seed of the held-out batches: the same for all runs, so that their errors can be compared.
+pub const HELD_OUT_SEED: u64 = 0xE7A1;
 
 /// Why a data set cannot be trained on.
 #[derive(Debug, thiserror::Error)]
@@ -86,19 +89,8 @@ pub struct Split {
     pub train: Vec<Episode>,
     /// Episodes to measure on.
     pub held_out: Vec<Episode>,
-    /// Their units, fitted on the training episodes.
+    /// Their units, fitted on the training episodes; the latent's spread is told by training.
     pub units: Units,
-}
-
-/// The units that a data set is brought to.
-#[derive(Clone, Debug)]
-pub struct Units {
-    /// The map to them.
-    pub normalizer: Normalizer,
-    /// Lower bound of each action column, raw units; what lies outside is held within.
-    pub action_low: Vec<f32>,
-    /// Upper bounds.
-    pub action_high: Vec<f32>,
 }
 
 /// Where units come from.
@@ -106,7 +98,7 @@ pub enum UnitsFrom<'a> {
     /// The data, with these wishes for actions.
     Data(&'a ActionsConfig),
     /// A checkpoint.
-    Checkpoint(&'a ModelConfig),
+    Checkpoint(&'a Units),
 }
 
 impl Dataset {
@@ -159,10 +151,7 @@ impl Dataset {
         let (train, held_out) = (spans(&train), spans(held_out));
         let (units, columns) = match from {
             UnitsFrom::Data(wishes) => self.fit(&train, wishes)?,
-            UnitsFrom::Checkpoint(config) => {
-                let (action_low, action_high) = (config.action_low.clone(), config.action_high.clone());
-                (Units { normalizer: config.normalizer.clone(), action_low, action_high }, Vec::new())
-            }
+            UnitsFrom::Checkpoint(units) => (units.clone(), Vec::new()),
         };
         let Fields { states, actions, rewards, context } = self.fields;
         let bounds = (units.action_low.clone(), units.action_high.clone());
@@ -190,7 +179,8 @@ impl Dataset {
         let state_change_std = change.std.iter().zip(&state.std).map(|(change, state)| change / state).collect();
         let normalizer = Normalizer { state, action: units::affine_of(&columns), reward, state_change_std };
         let bounds = |of: fn(&ActionColumn) -> f32| columns.iter().map(of).collect();
-        Ok((Units { normalizer, action_low: bounds(|column| column.low), action_high: bounds(|column| column.high) }, columns))
+        let (action_low, action_high) = (bounds(|column| column.low), bounds(|column| column.high));
+        Ok((Units { normalizer, action_low, action_high, latent_spread: 1.0 }, columns))
     }
 }
 

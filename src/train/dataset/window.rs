@@ -2,38 +2,17 @@
 
 use super::{Episode, hidden::Hide};
 use crate::model::{
-    diffusion::refine::WindowBatch,
+    diffusion::{
+        refine::{Standing, WindowBatch},
+        schedule::Table,
+    },
     latent::{Tokens, elbo::ElboBatch},
+    method::Looks,
     noise::Philox,
-    trajectory::Layout,
+    trajectory::{Layout, Seen},
 };
 use candle_core::{Device, Result, Tensor};
 use std::io;
-
-/// Which parts of a token are shown.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Seen {
-    /// s_t.
-    pub state: bool,
-    /// a_t.
-    pub action: bool,
-    /// r_t.
-    pub reward: bool,
-}
-
-impl Seen {
-    /// The whole token.
-    pub const ALL: Self = Self { state: true, action: true, reward: true };
-    /// The state alone: the current time of a decision.
-    pub const STATE: Self = Self { state: true, action: false, reward: false };
-    /// Nothing of it.
-    pub const NOTHING: Self = Self { state: false, action: false, reward: false };
-
-    /// 1 for each part that is shown, in the order of a token's presence.
-    pub fn flags(self) -> [f32; 3] {
-        [self.state, self.action, self.reward].map(f32::from)
-    }
-}
 
 /// Token columns under construction, row after row.
 pub struct TokenRows {
@@ -65,12 +44,11 @@ impl TokenRows {
         Ok(())
     }
 
-    /// Rows of `len` tokens each.
+    /// `batch` rows of `len` tokens each.
     ///
     /// # Errors
-    /// If the tokens do not fill whole rows.
-    pub fn tokens(self, len: usize) -> Result<Tokens> {
-        let batch = self.reward.len() / len.max(1);
+    /// If there are not as many tokens.
+    pub fn tokens(self, batch: usize, len: usize) -> Result<Tokens> {
         let tensor = |values: Vec<f32>, width: usize| Tensor::from_vec(values, (batch, len, width), &Device::Cpu);
         Ok(Tokens {
             noise: Tensor::zeros((batch, len, 1), candle_core::DType::F32, &Device::Cpu)?,
@@ -100,6 +78,15 @@ impl Places {
         Self { ends: ends.collect(), before }
     }
 
+    /// Only the start of each episode that has room for `len` steps.
+    pub fn starts(episodes: &[Episode], len: usize) -> Self {
+        let ends = episodes.iter().scan(0, |sum, episode| {
+            *sum += usize::from(episode.len() >= len);
+            Some(*sum)
+        });
+        Self { ends: ends.collect(), before: 0 }
+    }
+
     /// Whether no episode has room for the piece.
     pub fn is_empty(&self) -> bool {
         self.ends.last().is_none_or(|all| *all == 0)
@@ -120,8 +107,9 @@ pub struct BlockShape {
     pub batch: usize,
     /// Tokens in a block: `block_len + 1 + length`.
     pub len: usize,
-    /// Steps before an episode's start from which a block may begin (T_x).
-    pub before: usize,
+    /// How far the encoder looks back: a block may begin so many steps (T_x) before an episode's start; that of a GRU which runs on begins
+    /// there.
+    pub looks: Looks,
     /// Width of the latent.
     pub latent_dim: usize,
     /// Probability that the posterior sees the successor's action.
@@ -130,6 +118,16 @@ pub struct BlockShape {
     pub show_reward: f32,
     /// What is hidden of the history.
     pub hide: Hide,
+}
+
+impl BlockShape {
+    /// Where a block may begin.
+    pub fn places(&self, episodes: &[Episode]) -> Places {
+        match self.looks {
+            Looks::Block(before) => Places::new(episodes, before, self.len),
+            Looks::Running => Places::starts(episodes, self.len),
+        }
+    }
 }
 
 /// Draws a batch of blocks; `places` must be made for this shape.
@@ -158,7 +156,7 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
     }
     let eps = (0..shape.batch * steps * shape.latent_dim).map(|_| rng.normal()).collect();
     Ok(ElboBatch {
-        tokens: rows.tokens(shape.len)?,
+        tokens: rows.tokens(shape.batch, shape.len)?,
         valid: Tensor::from_vec(valid, (shape.batch, steps), &Device::Cpu)?,
         history_shown: Tensor::from_vec(history, (shape.batch, shape.len, 3), &Device::Cpu)?,
         successor_shown: Tensor::from_vec(successor, (shape.batch, steps, 3), &Device::Cpu)?,
@@ -172,13 +170,15 @@ pub struct WindowShape {
     /// Windows in a batch.
     pub batch: usize,
     /// Positions of a window (T).
-    pub plan_horizon: usize,
-    /// Tokens of history (T_x).
-    pub block_len: usize,
+    pub horizon: usize,
+    /// How far the encoder looks back.
+    pub looks: Looks,
     /// Real steps the denoiser sees (T_o).
     pub obs_horizon: usize,
-    /// Sub-steps per rung (n).
-    pub sub_steps: usize,
+    /// The rows that a sampler walks.
+    pub table: Table,
+    /// Which levels windows are shown at.
+    pub levels: Levels,
     /// Numbers of actions that an act may return (T_a): the sampler imagines up to `T_a - 1` steps of its history.
     pub action_horizons: Vec<usize>,
     /// Share of windows at READY rows, where latents are refined.
@@ -188,82 +188,133 @@ pub struct WindowShape {
 }
 
 impl WindowShape {
-    /// Rows `0 .. ready()` lead from pure noise to READY.
-    pub fn ready(&self) -> usize {
-        self.sub_steps * (self.plan_horizon - 1)
-    }
-
     /// The last step of a window must lie in the episode.
     pub fn places(&self, episodes: &[Episode]) -> Places {
-        Places::new(episodes, 0, self.plan_horizon)
+        Places::new(episodes, 0, self.horizon)
     }
 
-    /// What is seen of each step before the window, the last one first. Of imagined steps the sampler has its own states and actions,
-    /// and never a reward.
-    fn seen(&self, imagined: usize, rng: &mut Philox) -> Vec<Seen> {
+    /// What is seen of each of the `past` steps before the window, and of more if the denoiser looks back on more; the last one first. Of
+    /// imagined steps the sampler has its own states and actions, and never a reward.
+    fn seen(&self, past: usize, imagined: usize, rng: &mut Philox) -> Vec<Seen> {
         let hidden = self.hide.draw(rng);
         let seen = |back: usize| match (hidden.step(rng), back < imagined) {
-            (_, true) => Seen { reward: false, ..Seen::ALL },
+            (_, true) => Seen::GENERATED,
             (seen, false) => seen,
         };
-        (0..self.block_len.max(self.obs_horizon - 1)).map(seen).collect()
+        (0..past.max(self.obs_horizon - 1)).map(seen).collect()
     }
 
-    /// Ladder row and number of imagined steps. Only a window at READY can have imagined steps behind it.
-    fn draw_row(&self, rng: &mut Philox) -> (usize, usize) {
-        let ready = rng.uniform() < self.ready_fraction;
+    /// Where a window stands, and how many imagined steps are behind it; only a window at READY can have any.
+    fn draw_standing(&self, rng: &mut Philox) -> (Standing, usize) {
+        let at_ready = rng.uniform() < self.ready_fraction;
         let actions = self.action_horizons[rng.below(self.action_horizons.len())];
-        let (row, imagined) = (rng.uniform(), rng.below(actions));
-        let below = |bound: usize| ((row * bound as f32) as usize).min(bound - 1);
-        if ready {
-            return (self.ready() + below(self.sub_steps), imagined);
+        let (share, imagined) = (rng.uniform(), rng.below(actions));
+        let below = |bound: usize| ((share * bound as f32) as usize).min(bound - 1);
+        match (self.levels, self.table.ready()) {
+            (Levels::Independent { level_max }, _) => {
+                (Standing::Levels((0..self.horizon).map(|_| rng.below(level_max + 1)).collect()), if at_ready { imagined } else { 0 })
+            }
+            (Levels::Schedule, Some(ready)) if at_ready => (Standing::Row(ready + below(self.table.rung())), imagined),
+            (Levels::Schedule, ready) => {
+                let row = below(self.table.emit());
+                (Standing::Row(row), if ready.is_some_and(|ready| row >= ready) { imagined } else { 0 })
+            }
         }
-        let row = below(self.sub_steps * self.plan_horizon);
-        (row, if row >= self.ready() { imagined } else { 0 })
     }
 }
 
-/// Draws a batch of windows; `row` fixes the ladder row of all of them (measurement) instead of drawing it (training).
+/// Which levels a window is shown at in training.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Levels {
+    /// Those of a row of the table, as the sampler sees it.
+    Schedule,
+    /// Of each position one of its own, 0 ..= level_max (diffusion forcing).
+    Independent {
+        /// K.
+        level_max: usize,
+    },
+}
+
+/// A window that was drawn.
+struct Drawn<'a> {
+    episode: &'a Episode,
+    /// Its first step.
+    start: isize,
+    standing: Standing,
+    imagined: usize,
+    /// What is seen of the steps before it, the last one first.
+    seen: Vec<Seen>,
+}
+
+/// Draws a batch of windows; `row` fixes the table's row of all of them (measurement) instead of drawing it (training).
 ///
 /// # Errors
 /// If an episode cannot be read.
 pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: Option<usize>, rng: &mut Philox) -> Result<WindowBatch> {
-    let layout = episodes[0].layout;
-    let mut history = TokenRows::new(layout);
-    let (mut window, mut observed) = (Vec::new(), Vec::new());
-    let (mut rows, mut inpaint) = (Vec::new(), Vec::new());
-    for _ in 0..shape.batch {
+    let mut draw = || {
         let (index, start) = places.draw(rng);
-        let episode = &episodes[index];
-        let (drawn, imagined) = shape.draw_row(rng);
+        let (drawn, imagined) = shape.draw_standing(rng);
         let imagined = if row.is_some() { 0 } else { imagined };
-        for (back, seen) in shape.seen(imagined, rng).into_iter().enumerate().rev() {
-            let (t, back) = (start - 1 - back as isize, back + 1);
-            if back <= shape.block_len {
-                history.push(episode, t, seen)?;
-            }
-            if back < shape.obs_horizon {
-                push_step(&mut observed, episode, t, seen)?;
-            }
+        let past = match shape.looks {
+            Looks::Block(len) => len,
+            Looks::Running => start.unsigned_abs(),
+        };
+        let seen = shape.seen(past, imagined, rng);
+        Drawn { episode: &episodes[index], start, standing: row.map_or(drawn, Standing::Row), imagined, seen }
+    };
+    let drawn: Vec<Drawn> = (0..shape.batch).map(|_| draw()).collect();
+    let layout = episodes[0].layout;
+    let (mut window, mut observed) = (Vec::new(), Vec::new());
+    for Drawn { episode, start, seen, .. } in &drawn {
+        for back in (1..shape.obs_horizon).rev() {
+            push_step(&mut observed, episode, start - back as isize, seen[back - 1])?;
         }
-        (start..start + shape.plan_horizon as isize).try_for_each(|t| push_step(&mut window, episode, t, Seen::ALL))?;
-        rows.push(row.unwrap_or(drawn));
-        inpaint.push(imagined == 0);
+        (*start..start + shape.horizon as isize).try_for_each(|t| push_step(&mut window, episode, t, Seen::ALL))?;
     }
-    let dims = (shape.batch, shape.plan_horizon, layout.dim());
+    let dims = (shape.batch, shape.horizon, layout.dim());
     let noise: Vec<f32> = (0..window.len()).map(|_| rng.normal()).collect();
     let observed = match shape.obs_horizon {
         0 | 1 => None,
         real => Some(Tensor::from_vec(observed, (shape.batch, 1, (real - 1) * layout.dim()), &Device::Cpu)?),
     };
+    let pasts: Vec<_> = drawn.iter().map(|drawn| (drawn.episode, drawn.start)).collect();
+    let (history, history_lens) = histories(&pasts, shape.looks, |row, back| drawn[row].seen[back])?;
     Ok(WindowBatch {
-        history: history.tokens(shape.block_len)?,
+        history,
+        history_lens,
         window: Tensor::from_vec(window, dims, &Device::Cpu)?,
         observed,
-        rows,
-        inpaint,
+        at: drawn.iter().map(|drawn| drawn.standing.clone()).collect(),
+        imagined: drawn.iter().map(|drawn| drawn.imagined).collect(),
         noise: Tensor::from_vec(noise, dims, &Device::Cpu)?,
     })
+}
+
+/// The tokens before each place (episode, t), of which `seen(row, back)` is seen, `back` 0 being the last one: the last `len` of a block, or
+/// all of them from the start of the episode on, with padding behind, and how many there are.
+///
+/// # Errors
+/// If an episode cannot be read.
+pub fn histories(places: &[(&Episode, isize)], looks: Looks, seen: impl Fn(usize, usize) -> Seen) -> Result<(Tokens, Option<Vec<usize>>)> {
+    let Some((first, _)) = places.first() else { candle_core::bail!("no places: is a bug") };
+    let mut rows = TokenRows::new(first.layout);
+    match looks {
+        Looks::Block(len) => {
+            for (row, (episode, t)) in places.iter().enumerate() {
+                (0..len).rev().try_for_each(|back| rows.push(episode, t - 1 - back as isize, seen(row, back)))?;
+            }
+            Ok((rows.tokens(places.len(), len)?, None))
+        }
+        Looks::Running => {
+            let lens: Vec<usize> = places.iter().map(|(_, t)| t.unsigned_abs()).collect();
+            let longest = lens.iter().copied().max().unwrap_or(0).max(1);
+            for (row, (episode, _)) in places.iter().enumerate() {
+                (0..lens[row]).try_for_each(|t| rows.push(episode, t as isize, seen(row, lens[row] - 1 - t)))?;
+                (lens[row]..longest).try_for_each(|_| rows.push(episode, -1, Seen::NOTHING))?;
+            }
+            Ok((rows.tokens(places.len(), longest)?, Some(lens)))
+        }
+    }
 }
 
 /// (s_t, a_t), zeros for what is not seen and before the start.

@@ -1,6 +1,7 @@
 //! What becomes of the server when something around it is broken: the reader of its log, the disk that the log is on, a thread, a model.
 
 use super::*;
+use ada_diffuser::model::method::{Future, GruLatent, LatentSource, Looks};
 use std::{fs::File, net::TcpListener, time::Instant};
 
 /// The process on an address that is told to it, for its log will not tell; its stderr is `log`.
@@ -96,17 +97,19 @@ async fn broken_models_cost_themselves() {
     let tiny: ModelConfig = serde_json::from_slice(&fs::read("models/tiny/config.json").unwrap()).unwrap();
     alter(&dir.path().join("tiny"), &tiny, 1.0);
     let mut noisy = tiny.clone();
-    noisy.sampler.temperature = 10.0;
+    noisy.defaults.sampler.temperature = 10.0;
     // Its output is not finite for any state.
     alter(&dir.path().join("never-finite"), &noisy, 3e38);
     type Change = fn(&mut ModelConfig);
     let absurd: [(&str, Change); 6] = [
-        ("levels", |config| config.level_max = 1_000_000_000_000),
-        ("block", |config| config.block_len = 1 << 62),
-        ("horizon", |config| config.plan_horizon = usize::MAX / 2),
-        ("sub-steps", |config| config.sampler.sub_steps = (1 << 61) + 1),
-        ("clip", |config| config.state_clip = f32::INFINITY),
-        ("bounds", |config| config.action_low[0] = f32::NEG_INFINITY),
+        ("levels", |config| config.method.plan.level_max = 1_000_000_000_000),
+        ("block", |config| {
+            config.method.latent = LatentSource::Gru(GruLatent { dim: 6, hidden: 32, looks: Looks::Block(1 << 62), future: Future::Prior })
+        }),
+        ("horizon", |config| config.method.plan.horizon = usize::MAX / 2),
+        ("sub-steps", |config| config.defaults.sampler.sub_steps = (1 << 61) + 1),
+        ("clip", |config| config.method.plan.clip = f32::INFINITY),
+        ("bounds", |config| config.units.action_low[0] = f32::NEG_INFINITY),
     ];
     for (name, change) in absurd {
         let mut config = tiny.clone();

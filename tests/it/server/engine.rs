@@ -57,10 +57,10 @@ fn agent(name: &str) -> Arc<Agent> {
 fn narrow(dir: &Path) -> Agent {
     let mut config = checkpoint::load(&models_dir().join("tiny")).unwrap().config().clone();
     config.layout.state_dim -= 1;
-    config.normalizer.state = Affine::identity(config.layout.state_dim);
-    config.normalizer.state_change_std.pop();
+    config.units.normalizer.state = Affine::identity(config.layout.state_dim);
+    config.units.normalizer.state_change_std.pop();
     let params = Params::fresh(7);
-    Networks::new(&config, &params).unwrap();
+    Networks::new(config.layout, &config.method, &params).unwrap();
     let tensors = params.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
     checkpoint::save(dir, &config, &tensors, &Provenance::default()).unwrap();
     checkpoint::load(dir).unwrap()
@@ -71,11 +71,11 @@ fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Recei
     let episode = Arc::new(asked.open(seed, &asked.spec().sampler).unwrap());
     let observation = Observation { state: vec![0.1; asked.spec().layout.state_dim], ..Observation::default() };
     let question = Question { episode, observation };
-    let descent = question.begin(asked).unwrap();
+    let act = question.begin(asked).unwrap();
     let (outcome, receiver) = mpsc::channel();
     let ticket = Seat { outcome, gate: None, patience: Patience::default(), panics: false };
     let now = Instant::now();
-    (Job { agent: run_on.clone(), question, descent, ticket, submitted: now, turn_by: now, client: seed }, receiver)
+    (Job { agent: run_on.clone(), question, act, ticket, submitted: now, turn_by: now, client: seed }, receiver)
 }
 
 fn one_worker(batch_len_max: usize) -> Engine<Seat> {
@@ -180,7 +180,7 @@ fn a_deadline_makes_larger_jumps() {
     assert_eq!((finished.chunk.degraded, finished.chunk.evaluations), (true, 1), "nothing to give out before the first evaluation");
     let (mut next, outcome) = job(&slow, &slow, 1);
     next.question.episode = Arc::new(finished.episode);
-    next.descent = next.question.begin(&slow).unwrap();
+    next.act = next.question.begin(&slow).unwrap();
     let finished = act(next, outcome, Instant::now());
     assert_eq!((finished.chunk.degraded, finished.chunk.evaluations), (true, 0), "the window of the act before");
     let (calm, outcome) = job(&tiny, &tiny, 3);

@@ -126,7 +126,7 @@ async fn late_copies_change_nothing() {
     let id = server.open(json!({"model": "tiny", "seed": 1})).await;
     let client = Client { agent: server.agent().await, server, id };
     let agent = checkpoint::load(&models_dir().join("tiny")).unwrap();
-    let episode = agent.open(1, &agent.config().sampler).unwrap();
+    let episode = agent.open(1, &agent.config().defaults.sampler).unwrap();
     let mut oracle = Oracle { agent, episode, number: 0, step: 0, last: Vec::new() };
     let (mut rng, mut sent, mut late): (_, Vec<Message>, Vec<Message>) = (Philox::new(5), Vec::new(), Vec::new());
     let mut delivered = 0;

@@ -59,8 +59,9 @@ pub fn models_dir() -> &'static Path {
         let config: ModelConfig = serde_json::from_slice(&fs::read(tiny.join("config.json")).unwrap()).unwrap();
         copy(&tiny, &dir.path().join("tiny"));
         let mut slow = config.clone();
-        slow.level_max = SLOW_SUB_STEPS * slow.plan_horizon;
-        slow.sampler.sub_steps = SLOW_SUB_STEPS;
+        slow.method.plan.level_max = SLOW_SUB_STEPS * slow.method.plan.horizon;
+        slow.defaults.sampler.sub_steps = SLOW_SUB_STEPS;
+        slow.trained.sub_steps = vec![SLOW_SUB_STEPS];
         alter(&dir.path().join("slow"), &slow, 1.0);
         alter(&dir.path().join("exploding"), &config, 1e34);
         copy(&tiny, &dir.path().join("torn"));

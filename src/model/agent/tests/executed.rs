@@ -24,12 +24,13 @@ fn an_act_in_the_place_of_another_leaves_no_trace() {
         let (episode, chunk) = agent.act(&given_up, &again).unwrap();
         assert_eq!((episode.time(), chunk.start, chunk.degraded), (3, Start::Cold, false));
         // The same without the act that was given up, and without the window that it used up.
-        let cold = Episode { window: None, ..start };
+        let mut cold = start;
+        cold.take_stored();
         assert_eq!((episode.clone(), chunk), agent.act(&cold, &seen(here, vec![])).unwrap());
         // What follows goes on from the act that counts: its state, its actions.
         let (next, _) = agent.act(&episode, &seen(there, vec![])).unwrap();
-        let state = agent.config.normalizer.state.normalize(&here);
-        let first_step = &next.history[next.history.len() - 3];
+        let state = agent.config.units.normalizer.state.normalize(&here);
+        let first_step = &next.history()[next.history().len() - 3];
         assert_eq!((next.time(), first_step.state.as_deref()), (6, Some(&state[..])));
     }
 }
@@ -56,7 +57,7 @@ fn nothing_executed_cannot_be_cut_short() {
 #[test]
 fn more_steps_than_were_returned_catch_up() {
     let mut agent = agent(true, 1, unet());
-    agent.config.missing_trained.action = false;
+    agent.config.trained.missing.action = false;
     let (episode, chunk) = agent.act(&agent.open(1, &options()).unwrap(), &seen([0.1, 0.2, 0.3], vec![])).unwrap();
     let driven = |first: Option<[f32; 3]>| {
         let others = (1..5).map(|i| step(Some([i as f32 / 10.0; 3]), [0.1, -0.1 * i as f32]));
@@ -116,9 +117,9 @@ fn a_long_past_leaves_no_memory() {
     let long: Vec<_> = (0..5000).map(|t| step(Some([t as f32 / 1e4; 3]), [0.1, 0.2])).collect();
     let last = long[long.len() - 4..].to_vec();
     let (episode, chunk) = agent.act(&fresh, &seen([0.1; 3], long)).unwrap();
-    assert_eq!((episode.history.len(), episode.time()), (4, 5000));
-    assert!(episode.history.capacity() <= 8, "{}", episode.history.capacity());
-    let (short, same) = agent.act(&Episode { time: 4996, ..fresh }, &seen([0.1; 3], last)).unwrap();
-    assert!(chunk == same && episode.history == short.history);
-    assert!(episode.size_bytes() <= short.size_bytes() + 8 * size_of_val(&episode.history[0]));
+    assert_eq!((episode.history().len(), episode.time()), (4, 5000));
+    assert!(episode.history().capacity() <= 8, "{}", episode.history().capacity());
+    let (short, same) = agent.act(&fresh.at(4996), &seen([0.1; 3], last)).unwrap();
+    assert!(chunk == same && episode.history() == short.history());
+    assert!(episode.size_bytes() <= short.size_bytes() + 8 * size_of_val(&episode.history()[0]));
 }

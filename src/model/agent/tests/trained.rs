@@ -6,7 +6,7 @@ use crate::model::config::Missing;
 /// An agent whose checkpoint says that nothing of a history was ever hidden.
 fn whole_histories_only() -> Agent {
     let mut agent = agent(true, 1, unet());
-    agent.config.missing_trained = Missing::default();
+    agent.config.trained.missing = Missing::default();
     agent
 }
 
@@ -22,11 +22,11 @@ fn second(agent: &Agent, executed: Vec<Executed>) -> Result<Chunk, AgentError> {
 fn a_reward_that_was_never_missing_is_taken_as_the_mean() {
     let reported = |reward| vec![Executed { reward, ..Executed::default() }];
     let mut agent = whole_histories_only();
-    agent.config.normalizer.reward = Affine { mean: vec![3.0], std: vec![2.0] };
+    agent.config.units.normalizer.reward = Affine { mean: vec![3.0], std: vec![2.0] };
     let mean = second(&agent, reported(Some(3.0))).unwrap();
     assert_eq!(second(&agent, Vec::new()).unwrap(), mean);
     assert_eq!(second(&agent, reported(None)).unwrap(), mean);
-    agent.config.missing_trained.reward = true;
+    agent.config.trained.missing.reward = true;
     assert_ne!(second(&agent, Vec::new()).unwrap(), mean, "masked, as it was in training");
 }
 
@@ -46,7 +46,7 @@ fn other_gaps_are_refused_unless_trained() {
     let mut agent = whole_histories_only();
     assert_eq!(field(&agent, no_state.clone()), "executed[1].state");
     assert_eq!(field(&agent, no_action.clone()), "executed[1].action");
-    agent.config.missing_trained = Missing { state: true, action: true, reward: false };
+    agent.config.trained.missing = Missing { state: true, action: true, reward: false };
     assert!(second(&agent, no_state).is_ok() && second(&agent, no_action).is_ok());
 }
 
@@ -54,7 +54,7 @@ fn other_gaps_are_refused_unless_trained() {
 #[test]
 fn a_chunk_length_that_was_not_trained_is_refused() {
     let mut agent = agent(true, 1, unet());
-    agent.config.action_horizons_trained = vec![4, 1];
+    agent.config.trained.action_horizons = vec![1, 4];
     let open = |action_horizon| agent.open(1, &SamplerOptions { action_horizon, ..options() });
     assert!(open(1).is_ok() && open(4).is_ok());
     let error = open(2).unwrap_err().to_string();

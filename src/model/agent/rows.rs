@@ -1,0 +1,68 @@
+//! From acts to the rows of a batch, and back: only the acts that `which` takes, in their order.
+
+use super::Act;
+use crate::model::{
+    config::ModelConfig,
+    diffusion::descent::Walk,
+    latent::{Evidence, Gaussian, GaussianRef, Tokens},
+    nn::{Buffer, Value},
+    trajectory::{Layout, TokenRef},
+};
+use candle_core::Result;
+
+/// `(B, steps, width)`, each row written by its act.
+pub(super) fn gather(
+    acts: &[Act],
+    which: impl Fn(&Act) -> bool,
+    [steps, width]: [usize; 2],
+    write: &dyn Fn(&Act, &mut [f32]),
+) -> Result<Buffer> {
+    let rows = || acts.iter().filter(|act| which(act));
+    Buffer::generate([rows().count(), steps, width], |out| {
+        rows().zip(out.chunks_exact_mut((steps * width).max(1))).for_each(|(act, out)| write(act, out));
+    })
+}
+
+/// Sets the latent at `position` of each act, from a batch of these rows.
+pub(super) fn set_latents(latents: &Gaussian<Buffer>, acts: &mut [Act], which: impl Fn(&Act) -> bool, position: usize) {
+    let dim = latents.mean.len() / latents.mean.shape().map_or(1, |[batch, ..]| batch.max(1));
+    let rows = latents.mean.chunks_exact(dim).zip(latents.log_var.chunks_exact(dim));
+    for (act, (mean, log_var)) in acts.iter_mut().filter(|act| which(act)).zip(rows) {
+        act.latents_mut().set(position, GaussianRef { mean, log_var });
+    }
+}
+
+/// What the encoder sees of each act: the last tokens of its past, wholly absent ones in front where there are fewer, and the evidence
+/// behind them.
+pub(super) fn blocks(
+    acts: &[Act],
+    which: impl Fn(&Act) -> bool,
+    evidence: Evidence,
+    config: &ModelConfig,
+    walk: Walk,
+) -> Result<Tokens<Buffer>> {
+    let block_len = config.method.latent.block_len();
+    let ahead = &evidence.ahead()[..evidence.ahead().len().min(config.method.plan.horizon)];
+    let rows = acts.iter().filter(|act| which(act));
+    Tokens::pack(config.layout, rows, block_len + ahead.len(), |act, position| match position.checked_sub(block_len) {
+        None => act.past(block_len - 1 - position, walk).unwrap_or_default(),
+        Some(i) => act.ahead(i, evidence, walk).only(ahead[i]),
+    })
+}
+
+/// The oldest token that each act's GRU has not read, `(B, 1)`.
+pub(super) fn unread(acts: &[Act], which: impl Fn(&Act) -> bool, layout: Layout) -> Result<Tokens<Buffer>> {
+    Tokens::pack(layout, acts.iter().filter(|act| which(act)), 1, |act, _| act.unread().unwrap_or_default())
+}
+
+/// The last `steps` real steps (state, action) of each act, oldest first, zeros where unknown: `(B, 1, steps * D)`.
+pub(super) fn observed(acts: &[Act], which: impl Fn(&Act) -> bool, steps: usize, walk: Walk) -> Result<Buffer> {
+    let columns = walk.columns;
+    gather(acts, which, [1, steps * columns.width()], &|act, out| {
+        for (step, out) in out.chunks_exact_mut(columns.width()).enumerate() {
+            let TokenRef { state, action, .. } = act.past(steps - 1 - step, walk).unwrap_or_default();
+            state.into_iter().for_each(|known| out[columns.state.clone()].copy_from_slice(known));
+            action.into_iter().for_each(|known| out[columns.action.clone()].copy_from_slice(known));
+        }
+    })
+}

@@ -1,0 +1,164 @@
+//! Train what you serve: one episode, as a session lives it and as a training window is cut from it, gives the denoiser the same bits: the
+//! noisy window, its levels, its latents and its history, in every row of the table.
+
+use super::{
+    dataset::{
+        Episode,
+        hidden::Hide,
+        window::{Levels, Places, WindowShape, windows},
+    },
+    *,
+};
+use crate::model::{
+    Networks,
+    agent::{Agent, Executed, Observation},
+    diffusion::{
+        refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
+        schedule::Table,
+    },
+    method::{Backbone, Future, GruLatent, Looks, Schedule},
+    nn::Params,
+    noise::Philox,
+    options::SamplerOptions,
+    trajectory::Layout,
+};
+
+const LAYOUT: Layout = Layout { state_dim: 3, action_dim: 2 };
+const STEPS: usize = 24;
+const BATCH: usize = 16;
+
+fn config(latent: Option<(Looks, Future)>, schedule: Schedule, obs_horizon: usize, sub_steps: usize) -> ModelConfig {
+    let latent = latent.map(|(looks, future)| GruLatent { dim: 5, hidden: 16, looks, future });
+    let mut config = ModelConfig::plain(LAYOUT, latent, Backbone::Unet { widths: vec![8, 16] });
+    (config.method.plan.schedule, config.method.plan.obs_horizon) = (schedule, obs_horizon);
+    config.trained.sub_steps = vec![sub_steps];
+    let kappa = if config.method.can_refine() { f32::INFINITY } else { 0.0 };
+    config.trained.refined = config.method.can_refine();
+    config.defaults.sampler = SamplerOptions { sub_steps, action_horizon: 3, kappa, streaming: false, ..SamplerOptions::default() };
+    config
+}
+
+fn agent(config: &ModelConfig) -> Agent {
+    let networks = |params: &Params| Networks::new(config.layout, &config.method, params).unwrap();
+    let fresh = Params::fresh(5);
+    networks(&fresh);
+    let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
+    Agent::new(config.clone(), networks(&Params::loaded(tensors)), "same".into())
+}
+
+/// Episodes of numbers that no two places share, actions within their bounds.
+fn episodes() -> Vec<Episode> {
+    let mut rng = Philox::new(3);
+    let mut numbers = |count: usize, scale: f32| (0..count).map(|_| scale * (2.0 * rng.uniform() - 1.0)).collect::<Vec<f32>>();
+    (0..3).map(|_| Episode::of(LAYOUT, [numbers(STEPS * 3, 2.0), numbers(STEPS * 2, 1.0), numbers(STEPS, 1.0), Vec::new()])).collect()
+}
+
+fn numbers(tensor: &candle_core::Tensor, row: usize) -> Vec<f32> {
+    tensor.get(row).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+}
+
+/// Where the window of this row of a batch begins.
+fn place(episodes: &[Episode], batch: &WindowBatch, row: usize) -> (usize, usize) {
+    let first = &numbers(&batch.window, row)[..3];
+    let places = (0..episodes.len()).flat_map(|episode| (0..STEPS).map(move |t| (episode, t)));
+    places.clone().find(|(episode, t)| episodes[*episode].state(*t).unwrap()[..] == *first).unwrap()
+}
+
+/// The past that this row of the batch shows, as a client tells it: the last `imagined` steps are not told, they were given out.
+fn told(batch: &WindowBatch, row: usize, steps: usize, imagined: usize) -> Vec<Executed> {
+    let tokens = &batch.history;
+    let (state, action, reward) = (numbers(&tokens.state, row), numbers(&tokens.action, row), numbers(&tokens.reward, row));
+    let (present, len) = (numbers(&tokens.present, row), history_len(batch, row));
+    let step = |i: usize| Executed {
+        state: (present[3 * i] == 1.0).then(|| state[3 * i..3 * i + 3].to_vec()),
+        action: (present[3 * i + 1] == 1.0).then(|| action[2 * i..2 * i + 2].to_vec()),
+        reward: (present[3 * i + 2] == 1.0).then(|| reward[i]),
+    };
+    (len - steps.min(len)..len - imagined).map(step).collect()
+}
+
+fn history_len(batch: &WindowBatch, row: usize) -> usize {
+    batch.history_lens.as_ref().map_or(batch.history.batch_len().unwrap().1, |lens| lens[row])
+}
+
+fn check(config: &ModelConfig, hide: Hide) {
+    let (agent, episodes, plan) = (agent(config), episodes(), &config.method.plan);
+    let (sampler, latents_free) = (&config.defaults.sampler, config.method.latent.gru().is_none());
+    let shape = WindowShape {
+        batch: BATCH,
+        horizon: plan.horizon,
+        looks: config.method.latent.gru().map_or(Looks::Block(plan.obs_horizon), |gru| gru.looks),
+        obs_horizon: plan.obs_horizon,
+        table: Table::new(plan.schedule, plan.horizon, sampler.sub_steps, plan.level_max).unwrap(),
+        levels: Levels::Schedule,
+        action_horizons: if config.trained.refined || latents_free { vec![1, 2, 3] } else { vec![1] },
+        ready_fraction: 0.5,
+        hide,
+    };
+    let options = RefineOptions { routing: LatentRouting::Matched, first_action_weight: 1.0, sub_steps: sampler.sub_steps };
+    let (places, mut seen_rows) = (Places::new(&episodes, 0, plan.horizon), std::collections::BTreeSet::new());
+    for seed in 0..12 {
+        let batch = windows(&episodes, &places, &shape, None, &mut Philox::new(seed)).unwrap();
+        for row in 0..BATCH {
+            let one = batch.narrow(row, 1).unwrap();
+            let trained = agent.networks().read_in_training(plan, &one, &options).unwrap();
+            let Standing::Row(at) = one.at[0] else { panic!("a row") };
+            let at_ready = shape.table.ready().map_or(at, |ready| ready.min(at));
+            let ready = WindowBatch { at: vec![Standing::Row(at_ready)], ..batch.narrow(row, 1).unwrap() };
+            let [x_ready, ..] = agent.networks().read_in_training(plan, &ready, &options).unwrap();
+            let (_, start) = place(&episodes, &one, 0);
+            if start < one.imagined[0] {
+                // No act has given out more than it has lived through.
+                continue;
+            }
+            assert_same(&agent, &one, [&trained, &[x_ready, Vec::new(), Vec::new(), Vec::new()]], start);
+            seen_rows.insert(at);
+        }
+    }
+    assert_eq!(seen_rows.len(), shape.table.emit(), "every row");
+}
+
+fn assert_same(agent: &Agent, one: &WindowBatch, [trained, ready]: [&[Vec<f32>; 4]; 2], start: usize) {
+    let (imagined, Standing::Row(row)) = (one.imagined[0], one.at[0].clone()) else { panic!("a row") };
+    let sampler = &agent.config().defaults.sampler;
+    let episode = agent.open(1, sampler).unwrap();
+    let given: Vec<f32> = match imagined {
+        0 => Vec::new(),
+        steps => {
+            let (state, action, len) = (numbers(&one.history.state, 0), numbers(&one.history.action, 0), history_len(one, 0));
+            (len - steps..len).flat_map(|i| [&state[3 * i..3 * i + 3], &action[2 * i..2 * i + 2]].concat()).collect()
+        }
+    };
+    let state = numbers(&one.window, 0)[..3].to_vec();
+    let observation = Observation { state, executed: told(one, 0, start, imagined), nothing_executed: false };
+    let act = agent.begin(&episode, &observation).unwrap();
+    let served = agent.read_in_serving(act, row, [&trained[0], &ready[0], &given]).unwrap();
+    for (what, (trained, served)) in ["x", "levels", "latents", "history"].iter().zip(trained.iter().zip(&served)) {
+        let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+        assert_eq!(bits(trained), bits(served), "{what} in row {}, {imagined} imagined, from step {start}", row);
+    }
+}
+
+#[test]
+fn whole_histories() {
+    let (ladder, uniform) = (Schedule::Ladder, Schedule::Uniform { steps: 7 });
+    for (latent, schedule, obs_horizon, sub_steps) in [
+        (Some((Looks::Block(6), Future::Prior)), ladder, 1, 1),
+        (Some((Looks::Block(6), Future::Prior)), ladder, 3, 1),
+        (Some((Looks::Block(6), Future::Prior)), ladder, 2, 2),
+        (Some((Looks::Block(6), Future::Held)), ladder, 1, 1),
+        (Some((Looks::Block(6), Future::Held)), uniform, 1, 1),
+        (Some((Looks::Running, Future::Held)), ladder, 1, 1),
+        (Some((Looks::Running, Future::Held)), ladder, 3, 2),
+        (None, ladder, 4, 1),
+        (None, uniform, 1, 1),
+    ] {
+        check(&config(latent, schedule, obs_horizon, sub_steps), Hide::NOTHING);
+    }
+}
+
+#[test]
+fn histories_with_gaps() {
+    check(&config(Some((Looks::Running, Future::Held)), Schedule::Ladder, 1, 1), Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    check(&config(Some((Looks::Block(6), Future::Prior)), Schedule::Ladder, 3, 2), Hide { state: 0.4, action: 0.4, reward: 0.4 });
+}
