@@ -7,6 +7,8 @@ pub mod config;
 pub mod denoiser;
 pub mod diffusion;
 pub mod fit;
+#[cfg(test)]
+mod golden;
 pub mod latent;
 pub mod method;
 mod networks;

@@ -26,19 +26,19 @@ impl Agent {
     /// The filter: latents from real history and the current state; then the windows start.
     fn filter(&self, acts: &mut [Act]) -> Result<()> {
         let fresh = |act: &Act| act.asks(Ask::Filter);
-        if let Some(latent) = &self.networks.latent {
-            let block = rows::blocks(acts, fresh, Evidence::Filter, &self.config, self.walk())?;
+        if let Some(latent) = &self.networks().latent {
+            let block = rows::blocks(acts, fresh, Evidence::Filter, self.config(), self.walk())?;
             let filter = latent.infer(&block, self.read_on(latent, acts)?.as_ref())?;
             roll_out(latent, filter, acts, fresh, 0)?;
         }
-        acts.iter_mut().filter(|act| fresh(act)).for_each(|act| act.start(&self.config, self.walk()));
+        acts.iter_mut().filter(|act| fresh(act)).for_each(|act| act.start(self.config(), self.walk()));
         Ok(())
     }
 
     /// Where a GRU runs on over the episode: its states after all that was executed, `(B, 1, hidden)` for the acts that ask the filter. Each
     /// token is read once, and rows read as many as they have.
     fn read_on(&self, latent: &LatentModel, acts: &mut [Act]) -> Result<Option<Buffer>> {
-        let width = self.config.method.latent.gru().map_or(0, GruLatent::memory_len);
+        let width = self.config().method.latent.gru().map_or(0, GruLatent::memory_len);
         if width == 0 {
             return Ok(None);
         }
@@ -47,9 +47,9 @@ impl Agent {
         };
         let reads = |act: &Act| act.asks(Ask::Filter) && act.unread().is_some();
         while acts.iter().any(reads) {
-            let tokens = rows::unread(acts, reads, self.config.layout)?;
+            let tokens = rows::unread(acts, reads, self.config().layout)?;
             let after = latent.read(&tokens, Some(&states(acts, &reads)?))?;
-            let keep = self.config.method.plan.obs_horizon;
+            let keep = self.config().method.plan.obs_horizon;
             acts.iter_mut().filter(|act| reads(act)).zip(after.chunks_exact(width)).for_each(|(act, state)| act.remember(state, keep));
         }
         states(acts, &|act| act.asks(Ask::Filter)).map(Some)
@@ -59,8 +59,8 @@ impl Agent {
     /// filter's, and the others are rolled out anew from it.
     fn refine(&self, acts: &mut [Act]) -> Result<()> {
         let wants = |act: &Act| act.asks(Ask::Refine);
-        let Some(latent) = &self.networks.latent else { return Ok(()) };
-        let posterior = latent.infer(&rows::blocks(acts, wants, Evidence::Refinement, &self.config, self.walk())?, None)?;
+        let Some(latent) = &self.networks().latent else { return Ok(()) };
+        let posterior = latent.infer(&rows::blocks(acts, wants, Evidence::Refinement, self.config(), self.walk())?, None)?;
         let [count, _, dim] = posterior.mean.shape()?;
         let mut log_var = Buffer::generate([count, 1, dim], |out| out.copy_from_slice(&posterior.log_var))?;
         let mean = Buffer::generate([count, 1, dim], |mean| {
@@ -81,19 +81,19 @@ impl Agent {
         let inputs = self.inputs(acts, wants)?;
         let Inputs { x, levels, latents, observed } = &inputs;
         let given = Given { levels, latents: latents.as_ref(), observed: observed.as_ref() };
-        let x0 = self.networks.denoiser.predict(x, &given)?;
-        let size = self.config.method.plan.horizon * self.columns.width();
+        let x0 = self.networks().denoiser.predict(x, &given)?;
+        let size = self.config().method.plan.horizon * self.walk().columns.width();
         acts.iter_mut().filter(|act| wants(act)).zip(x0.chunks_exact(size)).for_each(|(act, x0)| act.step_down(x0, self.walk()));
         Ok(())
     }
 
     fn inputs(&self, acts: &[Act], which: impl Fn(&Act) -> bool) -> Result<Inputs> {
-        let plan = &self.config.method.plan;
+        let plan = &self.config().method.plan;
         let by_row = |width: usize, write: &dyn Fn(&Act, &mut [f32])| rows::gather(acts, &which, [plan.horizon, width], write);
         Ok(Inputs {
-            x: by_row(self.columns.width(), &|act, out| out.copy_from_slice(act.descent().x()))?,
+            x: by_row(self.walk().columns.width(), &|act, out| out.copy_from_slice(act.descent().x()))?,
             levels: by_row(1, &|act, out| act.descent().write_levels(out))?,
-            latents: self.config.method.latent.gru().map(|latent| by_row(latent.dim, &Act::write_latents)).transpose()?,
+            latents: self.config().method.latent.gru().map(|latent| by_row(latent.dim, &Act::write_latents)).transpose()?,
             observed: (plan.obs_horizon > 1).then(|| rows::observed(acts, &which, plan.obs_horizon - 1, self.walk())).transpose()?,
         })
     }

@@ -26,7 +26,7 @@ impl Agent {
     /// Step `j` of what was executed. What is missing is known from the last act, or masked if training hid it now and then; else a reward
     /// is taken to be the mean one, which harms least (Point-Wind-S: -21.3, masked -44.7, told -21.1), and the rest is refused.
     fn executed_token(&self, planned: Option<&Planned>, j: usize, step: &Executed) -> Result<Token, AgentError> {
-        let (layout, normalizer, trained) = (self.config.layout, &self.config.units.normalizer, self.config.trained.missing);
+        let (layout, normalizer, trained) = (self.config().layout, &self.config().units.normalizer, self.config().trained.missing);
         let field = |name: &str| format!("executed[{j}].{name}");
         let missing = |name: &str, trained: bool, why: &str| match trained {
             true => Ok(None),
@@ -39,7 +39,7 @@ impl Agent {
             (None, _) => missing("state", trained.state, untrained)?,
         };
         let action = match (&step.action, planned.and_then(|planned| planned.actions().get(j))) {
-            (Some(action), _) => Some(self.config.units.normalize_action(&self.checked(&field("action"), action, layout.action_dim)?)),
+            (Some(action), _) => Some(self.config().units.normalize_action(&self.checked(&field("action"), action, layout.action_dim)?)),
             (None, Some(returned)) => Some(returned.clone()),
             (None, None) => missing("action", trained.action, "and no action was returned for this step")?,
         };

@@ -1,8 +1,9 @@
-//! The denoiser on both kinds of values, and by row.
+//! The denoiser on both kinds of values, by row, and against PyTorch's.
 
 use super::*;
 use crate::model::{
     config::ModelConfig,
+    golden::Golden,
     method::{Future, GruLatent, Looks},
     nn::{Buffer, Precision, kernels::testing::with_each_isa},
     noise::Philox,
@@ -93,6 +94,45 @@ fn bf16_weights_are_near() {
         let norm = |values: &mut dyn Iterator<Item = f32>| values.map(|value| value * value).sum::<f32>().sqrt();
         let share = norm(&mut full.iter().zip(half.iter()).map(|(a, b)| a - b)) / norm(&mut full.iter().copied());
         assert!((1e-4..2e-2).contains(&share), "{share}");
+    }
+}
+
+/// What the network of a golden case is.
+fn golden_config(case: &str) -> ModelConfig {
+    let (unet, dit) =
+        (|widths: &[usize]| Backbone::Unet { widths: widths.to_vec() }, |width, depth, heads| Backbone::Dit { width, depth, heads });
+    let (backbone, dim, obs_horizon) = match case {
+        "unet" => (unet(&[5, 16, 3]), 4, 3),
+        "unet_observed" => (unet(&[4, 4]), 0, 2),
+        "unet_latents" => (unet(&[3, 7]), 3, 1),
+        "unet_plain" => (unet(&[6]), 0, 1),
+        "dit" => (dit(12, 2, 3), 4, 3),
+        "dit_observed" => (dit(10, 1, 1), 0, 2),
+        "dit_latents" => (dit(6, 3, 3), 3, 1),
+        _ => (dit(4, 0, 2), 0, 1),
+    };
+    let latent = (dim > 0).then_some(GruLatent { dim, hidden: 8, looks: Looks::Block(4), future: Future::Prior });
+    let mut config = ModelConfig::plain(LAYOUT, latent, backbone);
+    config.method.plan.obs_horizon = obs_horizon;
+    config
+}
+
+/// The whole network of both backbones, with latents and real steps, either, and none: results and all gradients.
+#[test]
+fn networks_against_pytorch() {
+    for case in ["unet", "unet_observed", "unet_latents", "unet_plain", "dit", "dit_observed", "dit_latents", "dit_plain"] {
+        let (golden, config) = (Golden::of(case), golden_config(case));
+        let levels = golden.flat("in.levels");
+        golden.check_training(|given, params| {
+            let condition = Given { levels: &levels, latents: given.get("latents"), observed: given.get("observed") };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT.dim(), &config.method, params)?.predict(&given["x"], &condition)?)])
+        });
+        golden.check_serving(|params| {
+            let latents: Option<Buffer> = config.method.latent.gru().is_some().then(|| golden.value("in.latents"));
+            let observed: Option<Buffer> = (config.method.plan.obs_horizon > 1).then(|| golden.value("in.observed"));
+            let condition = Given { levels: &levels, latents: latents.as_ref(), observed: observed.as_ref() };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT.dim(), &config.method, params)?.predict(&golden.value("in.x"), &condition)?)])
+        });
     }
 }
 

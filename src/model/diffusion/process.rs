@@ -76,6 +76,26 @@ impl Process {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::golden::Golden;
+
+    /// The table of Nichol and Dhariwal, DDIM's jumps, and the DDPM posterior over several levels at once, as PyTorch computes them.
+    #[test]
+    fn process_against_pytorch() {
+        let golden = Golden::of("process");
+        for level_max in [40, 150] {
+            let process = Process::cosine(level_max);
+            let expected = golden.flat(&format!("alphas{level_max}"));
+            assert_eq!(expected.len(), level_max + 1);
+            for (level, expected) in expected.into_iter().map(f64::from).enumerate() {
+                assert!((process.alpha_bar(level) / expected - 1.0).abs() < 2e-7, "level {level} of {level_max}");
+            }
+        }
+        for row in golden.flat("jumps").chunks_exact(6) {
+            let Jump { x0, eps, noise } = Process::cosine(40).jump(row[0] as usize, row[1] as usize, row[2]);
+            let errors = [x0 - row[3], eps - row[4], noise - row[5]];
+            assert!(errors.iter().all(|error| error.abs() < 2e-7), "{row:?}: {errors:?}");
+        }
+    }
 
     #[test]
     fn alpha_bar_falls_from_one_to_nothing() {

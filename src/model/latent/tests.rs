@@ -1,7 +1,11 @@
-//! The latent networks on both kinds of values.
+//! The latent networks on both kinds of values, and against PyTorch's.
 
-use super::*;
+use super::{
+    elbo::{ElboBatch, ElboOptions},
+    *,
+};
 use crate::model::{
+    golden::Golden,
     method::{Future, GruLatent, Looks},
     nn::{Buffer, Precision},
     noise::Philox,
@@ -64,4 +68,54 @@ fn a_row_does_not_depend_on_its_batch() {
         let parts = together.chunks_exact(rows.len() * 6).flat_map(|part| part[i * 6..][..6].iter().copied());
         assert_eq!(alone, parts.collect::<Vec<_>>(), "row {i}");
     }
+}
+
+fn golden_latent(dim: usize, hidden: usize) -> GruLatent {
+    GruLatent { dim, hidden, looks: Looks::Block(LEN), future: Future::Prior }
+}
+
+/// Posteriors, the prior after the last of them, and what the decoder makes of their means: the results of the golden case, by name.
+fn everything<V: Value>(tokens: &Tokens<V>, params: &Params) -> candle_core::Result<Vec<(String, V)>> {
+    let model = LatentModel::new(&golden_latent(3, 9), LAYOUT, params)?;
+    let posteriors = model.encoder.posterior(&model.encoder.states(tokens, None)?)?;
+    let (change, reward) = model.decoder.predict(&tokens.state, &tokens.action, &posteriors.mean)?;
+    let mut named = vec![("change".into(), change), ("reward".into(), reward)];
+    let mut tell = |name: &str, gaussian: &Gaussian<V>| {
+        named.push((format!("mean{name}"), gaussian.mean.clone()));
+        named.push((format!("log_var{name}"), gaussian.log_var.clone()));
+    };
+    tell("", &posteriors);
+    let mut step = 0;
+    model.roll_out(model.infer(tokens, None)?, 3, |next| {
+        step += 1;
+        tell(&step.to_string(), next);
+        Ok(())
+    })?;
+    Ok(named)
+}
+
+#[test]
+fn networks_against_pytorch() {
+    let golden = Golden::of("latent");
+    golden.check_training(|given, params| everything(&tokens_of(|name| given[name].clone()), params));
+    golden.check_serving(|params| everything(&tokens_of::<Buffer>(|name| golden.value(&format!("in.{name}"))), params));
+}
+
+/// The loss of stage 1 and its gradients.
+#[test]
+fn elbo_against_pytorch() {
+    let options = ElboOptions { kl_weight: 0.3, state_change_std: vec![0.5, 1.0, 2.0], reward_weight: 0.7 };
+    Golden::of("elbo").check_training(|given, params| {
+        let [valid, history_shown, successor_shown, eps] =
+            ["valid", "history_shown", "successor_shown", "eps"].map(|name| given[name].clone());
+        let batch = ElboBatch { tokens: tokens_of(|name| given[name].clone()), valid, history_shown, successor_shown, eps };
+        let terms = LatentModel::new(&golden_latent(2, 7), LAYOUT, params)?.elbo(&batch, &options)?;
+        let named = [("loss", terms.loss), ("state_error", terms.state_error), ("reward_error", terms.reward_error), ("kl", terms.kl)];
+        Ok(named.map(|(name, term)| (name.into(), term)).into())
+    });
+}
+
+fn tokens_of<V>(value: impl Fn(&str) -> V) -> Tokens<V> {
+    let [state, action, reward, present, noise] = ["state", "action", "reward", "present", "noise"].map(value);
+    Tokens { state, action, reward, present, noise }
 }

@@ -8,16 +8,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Imports on a circle, (file, file that it names): each to be undone. A module and those right below it may name each other.
 const KNOWN: &[(&str, &str)] = &[
-    ("model/agent/types.rs", "model/config.rs"),
-    ("model/check.rs", "model/agent/types.rs"),
-    ("model/check.rs", "model/config.rs"),
-    ("model/check.rs", "model/networks.rs"),
-    ("model/config.rs", "model/agent/types.rs"),
-    ("model/config.rs", "model/denoiser/mod.rs"),
-    ("model/denoiser/mod.rs", "model/check.rs"),
-    ("model/denoiser/mod.rs", "model/config.rs"),
-    ("model/networks.rs", "model/config.rs"),
-    ("model/networks.rs", "model/denoiser/mod.rs"),
     ("model/nn/conv1d.rs", "model/nn/value.rs"),
     ("model/nn/gru.rs", "model/nn/conv1d.rs"),
     ("model/nn/gru.rs", "model/nn/value.rs"),
@@ -30,21 +20,6 @@ const KNOWN: &[(&str, &str)] = &[
     ("model/nn/value.rs", "model/nn/gru.rs"),
     ("model/nn/value.rs", "model/nn/join.rs"),
     ("model/nn/value.rs", "model/nn/norm.rs"),
-    ("serve/connections/bodies.rs", "serve/grpc/mod.rs"),
-    ("serve/grpc/mod.rs", "serve/listener.rs"),
-    ("serve/listener.rs", "serve/connections/bodies.rs"),
-    ("serve/listener.rs", "serve/grpc/mod.rs"),
-    ("serve/listener.rs", "serve/wire.rs"),
-    ("serve/wire.rs", "serve/listener.rs"),
-    ("train/amend.rs", "train/resume.rs"),
-    ("train/dataset/hidden.rs", "train/dataset/window.rs"),
-    ("train/dataset/window.rs", "train/dataset/hidden.rs"),
-    ("train/learner.rs", "train/stage1.rs"),
-    ("train/resume.rs", "train/amend.rs"),
-    ("train/stage1.rs", "train/learner.rs"),
-    ("train/stage1.rs", "train/stage2.rs"),
-    ("train/stage2.rs", "train/learner.rs"),
-    ("train/stage2.rs", "train/stage1.rs"),
 ];
 
 /// Imports, tests' aside, from and to which there is a way back, between files that are not parent and child.

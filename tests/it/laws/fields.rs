@@ -12,38 +12,7 @@ const ROOM: &str = "model/agent/";
 const PLAIN: &str = "model/agent/types.rs";
 
 /// Fields that other files can read, or do read, (file, field of a struct): each to be closed.
-const KNOWN: &[(&str, &str)] = &[
-    ("model/agent/advance.rs", "Agent.config"),
-    ("model/agent/advance.rs", "Agent.networks"),
-    ("model/agent/advance.rs", "Agent.process"),
-    ("model/agent/descent.rs", "Descent.allowance"),
-    ("model/agent/descent.rs", "Descent.chain"),
-    ("model/agent/descent.rs", "Descent.degraded"),
-    ("model/agent/descent.rs", "Descent.episode"),
-    ("model/agent/descent.rs", "Descent.evaluations"),
-    ("model/agent/descent.rs", "Descent.ladder"),
-    ("model/agent/descent.rs", "Descent.row"),
-    ("model/agent/descent.rs", "Descent.start"),
-    ("model/agent/descent.rs", "Descent.started"),
-    ("model/agent/descent.rs", "Descent.state"),
-    ("model/agent/descent.rs", "Descent.x"),
-    ("model/agent/descent.rs", "Walk.config"),
-    ("model/agent/descent.rs", "Walk.process"),
-    ("model/agent/episode.rs", "Agent.config"),
-    ("model/agent/episode.rs", "Episode.history"),
-    ("model/agent/episode.rs", "Episode.latent"),
-    ("model/agent/episode.rs", "Episode.options"),
-    ("model/agent/episode.rs", "Episode.planned"),
-    ("model/agent/episode.rs", "Episode.seed"),
-    ("model/agent/episode.rs", "Episode.time"),
-    ("model/agent/episode.rs", "Episode.window"),
-    ("model/agent/episode.rs", "Planned.actions"),
-    ("model/agent/episode.rs", "Planned.state"),
-    ("model/agent/episode.rs", "Window.anchor"),
-    ("model/agent/episode.rs", "Window.predicted_state"),
-    ("model/agent/episode.rs", "Window.row"),
-    ("model/agent/episode.rs", "Window.x"),
-];
+const KNOWN: &[(&str, &str)] = &[];
 
 /// The names of a struct's fields, with those that others can see.
 fn fields(item: &ItemStruct) -> impl Iterator<Item = (String, bool)> {

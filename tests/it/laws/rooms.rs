@@ -26,7 +26,7 @@ const APART: &[(&str, &[&str])] = &[
 const KNOWN_ACROSS: &[(&str, &str)] =
     &[("serve/session/flight.rs", "serve/engine/mod.rs"), ("serve/session/mod.rs", "serve/engine/mod.rs")];
 /// Imports against the order of `src/lib.rs`, likewise.
-const KNOWN_UPWARD: &[(&str, &str)] = &[("model/config.rs", "model/agent/types.rs"), ("model/denoiser/mod.rs", "model/config.rs")];
+const KNOWN_UPWARD: &[(&str, &str)] = &[];
 
 /// Whether a file belongs to a module: is its file, or that of a module below it.
 pub fn belongs(file: &str, module: &str) -> bool {
@@ -43,11 +43,14 @@ pub fn across(imports: &[Import]) -> BTreeSet<(String, String)> {
     imports.iter().filter(crosses).map(|import| (import.from.clone(), import.to.clone())).collect()
 }
 
-/// The order of the model's modules as `map` prints it, lowest first: `model: a, b <- {c | d} <- e`.
+/// The order of the model's modules as `map` prints it, lowest first: `model: a, b <- {c | d} <- e`, on lines of their own.
 pub fn order(map: &str) -> Vec<Vec<String>> {
-    let line = map.lines().find_map(|line| line.strip_prefix("//! model: ")).expect("the map says what may use what");
+    let mut lines = map.lines().skip_while(|line| !line.starts_with("//! model: "));
+    let first = lines.next().and_then(|line| line.strip_prefix("//! model: ")).expect("the map says what may use what");
+    let rest = lines.map_while(|line| line.strip_prefix("//!     "));
+    let order: String = std::iter::once(first).chain(rest).collect();
     let names = |rank: &str| rank.split([',', '|', '{', '}', ' ']).filter(|name| !name.is_empty()).map(str::to_owned).collect();
-    line.split("<-").map(names).collect()
+    order.split("<-").map(names).collect()
 }
 
 /// Imports, tests' aside, of something above, or beside.

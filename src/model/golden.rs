@@ -1,0 +1,99 @@
+//! Whole networks against PyTorch's numbers; `tests/golden/make_networks.py` tells how they were made, in float64.
+
+use crate::model::nn::{Buffer, Params, Value};
+use candle_core::{DType, Device, Result, Tensor, Var};
+use std::collections::BTreeMap;
+
+/// Largest error of a result, in units of its largest value, or of 0.1.
+const RESULT_ERROR: f32 = 1e-5;
+/// The same of a gradient.
+const GRADIENT_ERROR: f32 = 2e-5;
+
+/// The numbers of one case, by their names within it: `in.*`, `y.*`, `r.*`, `p.*`, `d.*`, `dp.*`.
+pub struct Golden {
+    case: &'static str,
+    numbers: BTreeMap<String, Tensor>,
+}
+
+impl Golden {
+    /// Those of `networks.safetensors`.
+    pub fn of(case: &'static str) -> Self {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/networks.safetensors");
+        let all = candle_core::safetensors::load(path, &Device::Cpu).unwrap();
+        let ours = |(name, number): (String, Tensor)| {
+            Some((name.strip_prefix(case)?.strip_prefix('.')?.to_owned(), number.to_dtype(DType::F32).unwrap()))
+        };
+        let numbers: BTreeMap<_, _> = all.into_iter().filter_map(ours).collect();
+        assert!(!numbers.is_empty(), "no case {case}");
+        Self { case, numbers }
+    }
+
+    /// All values of one of them.
+    pub fn flat(&self, name: &str) -> Vec<f32> {
+        flat(&self.numbers[name])
+    }
+
+    /// One of them as an input of three dimensions.
+    pub fn value<V: Value>(&self, name: &str) -> V {
+        let number = &self.numbers[name];
+        let (batch, steps, channels) = number.dims3().unwrap();
+        V::generate([batch, steps, channels], |out| out.copy_from_slice(&flat(number))).unwrap()
+    }
+
+    /// Names below `kind`, in order.
+    fn names(&self, kind: &str) -> Vec<String> {
+        self.numbers.keys().filter_map(|name| name.strip_prefix(kind)?.strip_prefix('.').map(str::to_owned)).collect()
+    }
+
+    /// A network of training gives these results and these gradients; `run` makes the results by name, of inputs by name.
+    pub fn check_training(&self, run: impl Fn(&BTreeMap<String, Tensor>, &Params) -> Result<Vec<(String, Tensor)>>) {
+        let variable = |name: String| (name.clone(), Var::from_tensor(&self.numbers[&format!("in.{name}")]).unwrap());
+        let inputs: BTreeMap<String, Var> = self.names("in").into_iter().map(variable).collect();
+        let tensors = inputs.iter().map(|(name, var)| (name.clone(), var.as_tensor().clone())).collect();
+        let params = Params::fresh(1);
+        run(&tensors, &params).unwrap();
+        let vars = params.vars();
+        assert_eq!(vars.keys().cloned().collect::<Vec<_>>(), self.names("p"), "{}: parameters", self.case);
+        vars.iter().for_each(|(name, var)| var.set(&self.numbers[&format!("p.{name}")]).unwrap());
+        let mut loss = Tensor::new(0f32, &Device::Cpu).unwrap();
+        for (name, y) in self.checked(run(&tensors, &params).unwrap(), flat) {
+            loss = (loss + (y * &self.numbers[&format!("r.{name}")]).unwrap().sum_all().unwrap()).unwrap();
+        }
+        let grads = loss.backward().unwrap();
+        let inputs = self.names("d").into_iter().map(|name| (format!("d.{name}"), &inputs[&name]));
+        for (name, var) in inputs.chain(vars.iter().map(|(name, var)| (format!("dp.{name}"), var))) {
+            let grad = grads.get(var).unwrap_or_else(|| panic!("{}: {name} got no gradient", self.case));
+            self.expect(&name, &flat(grad), GRADIENT_ERROR);
+        }
+    }
+
+    /// A network that serves gives these results.
+    pub fn check_serving(&self, run: impl Fn(&Params) -> Result<Vec<(String, Buffer)>>) {
+        let named = self.names("p").into_iter().map(|name| (name.clone(), self.numbers[&format!("p.{name}")].clone()));
+        let params = Params::loaded(named.collect());
+        self.checked(run(&params).unwrap(), |y| y.to_vec());
+        assert_eq!(params.unused(), Vec::<String>::new(), "{}: parameters", self.case);
+    }
+
+    /// All results, each as it should be.
+    fn checked<V>(&self, results: Vec<(String, V)>, numbers: impl Fn(&V) -> Vec<f32>) -> Vec<(String, V)> {
+        let mut names: Vec<_> = results.iter().map(|(name, _)| name.clone()).collect();
+        names.sort();
+        assert_eq!(names, self.names("y"), "{}: results", self.case);
+        results.iter().for_each(|(name, y)| self.expect(&format!("y.{name}"), &numbers(y), RESULT_ERROR));
+        results
+    }
+
+    fn expect(&self, name: &str, found: &[f32], error_max: f32) {
+        let expected = self.flat(name);
+        assert_eq!(found.len(), expected.len(), "{}: {name}", self.case);
+        let scale = expected.iter().fold(0.1_f32, |top, x| top.max(x.abs()));
+        let errors = found.iter().zip(&expected).map(|(a, b)| if (a - b).is_nan() { f32::INFINITY } else { (a - b).abs() });
+        let error = errors.fold(0.0, f32::max) / scale;
+        assert!(error <= error_max, "{}: {name} is {error:e} of its largest value off", self.case);
+    }
+}
+
+fn flat(tensor: &Tensor) -> Vec<f32> {
+    tensor.flatten_all().unwrap().to_vec1().unwrap()
+}
