@@ -5,7 +5,7 @@ use ada_diffuser::model::nn::kernels::{
     activation::{self, Activation},
     attention::Attention,
     convolution::{ConvShape, Convolution},
-    norm::{self, Norm},
+    norm::{self, Norm, NormGrads},
 };
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;
@@ -20,7 +20,7 @@ fn values(count: usize) -> Vec<f32> {
 fn convolution(c: &mut Criterion) {
     let shape = ConvShape { c_in: 64, c_out: 64, kernel: 5, stride: 1, padding: 2 };
     let weight = values(64 * 64 * 5);
-    let (forward, back) = (shape.pack_gather(&weight), shape.pack_spread(&weight));
+    let (forward, back, mut dw) = (shape.pack_gather(&weight), shape.pack_spread(&weight), weight.clone());
     let mut group = c.benchmark_group("convolution");
     for batch in BATCHES {
         let plan = Convolution { shape, batch, wide_steps: 8, narrow_steps: 8 };
@@ -29,7 +29,7 @@ fn convolution(c: &mut Criterion) {
         group.throughput(Throughput::Elements(2 * (batch * 8 * 64 * 64 * 5) as u64));
         group.bench_function(format!("forward, batch {batch}"), |b| b.iter(|| plan.gather(black_box(&x), &forward, None, &mut out)));
         group.bench_function(format!("input gradient, batch {batch}"), |b| b.iter(|| plan.spread(black_box(&dy), &back, None, &mut out)));
-        group.bench_function(format!("weight gradient, batch {batch}"), |b| b.iter(|| plan.weight_grad(black_box(&x), &dy)));
+        group.bench_function(format!("weight gradient, batch {batch}"), |b| b.iter(|| plan.weight_grad(black_box(&x), &dy, &mut dw)));
     }
     group.throughput(Throughput::Elements(weight.len() as u64));
     group.bench_function("pack for forward", |b| b.iter(|| shape.pack_gather(black_box(&weight))));
@@ -44,12 +44,12 @@ fn linear(c: &mut Criterion) {
     let (forward, back) = (shape.pack_gather(&weight), shape.pack_spread(&weight));
     let plan = Convolution { shape, batch: 1, wide_steps: rows, narrow_steps: rows };
     let (x, dy) = (values(rows * 256), values(rows * 1024));
-    let (mut y, mut dx) = (dy.clone(), x.clone());
+    let (mut y, mut dx, mut dw) = (dy.clone(), x.clone(), weight.clone());
     let mut group = c.benchmark_group("linear");
     group.throughput(Throughput::Elements(2 * (rows * 256 * 1024) as u64));
     group.bench_function("forward", |b| b.iter(|| plan.gather(black_box(&x), &forward, None, &mut y)));
     group.bench_function("input gradient", |b| b.iter(|| plan.spread(black_box(&dy), &back, None, &mut dx)));
-    group.bench_function("weight gradient", |b| b.iter(|| plan.weight_grad(black_box(&x), &dy)));
+    group.bench_function("weight gradient", |b| b.iter(|| plan.weight_grad(black_box(&x), &dy, &mut dw)));
     group.finish();
 }
 
@@ -59,10 +59,16 @@ fn normalisation(c: &mut Criterion) {
     let (weight, bias) = (values(64), values(64));
     for batch in BATCHES {
         let x = values(batch * 8 * 64);
-        let mut out = x.clone();
+        let (mut out, mut dx, mut d_weight, mut d_bias) = (x.clone(), x.clone(), weight.clone(), bias.clone());
         group.throughput(Throughput::Elements(x.len() as u64));
         group.bench_function(format!("forward, batch {batch}"), |b| b.iter(|| norm::in_place(norm, black_box(&mut out), &weight, &bias)));
-        group.bench_function(format!("backward, batch {batch}"), |b| b.iter(|| norm::backward(norm, black_box(&x), (&weight, &bias), &x)));
+        group.bench_function(format!("backward, batch {batch}"), |b| {
+            b.iter(|| {
+                dx.copy_from_slice(&x);
+                let grads = NormGrads { x: &mut dx, weight: Some(&mut d_weight), bias: Some(&mut d_bias) };
+                norm::backward(norm, black_box(&x), (&weight, &bias), grads);
+            })
+        });
     }
     group.finish();
 }
@@ -81,9 +87,9 @@ fn elementwise(c: &mut Criterion) {
 fn attention(c: &mut Criterion) {
     let mut group = c.benchmark_group("attention");
     let (plan, qkv, grad) = (Attention { batch: 1, steps: 42, heads: 8, head_dim: 32 }, values(42 * 768), values(42 * 256));
-    let mut out = grad.clone();
+    let (mut out, mut dqkv) = (grad.clone(), qkv.clone());
     group.bench_function("forward", |b| b.iter(|| plan.forward(black_box(&qkv), &mut out)));
-    group.bench_function("backward", |b| b.iter(|| plan.backward(black_box(&qkv), &grad)));
+    group.bench_function("backward", |b| b.iter(|| plan.backward(black_box(&qkv), &grad, &mut dqkv)));
     group.finish();
 }
 

@@ -9,7 +9,7 @@ use ada_diffuser::model::{
     config::ModelConfig,
     denoiser::{Denoiser, Given},
     method::{Backbone, Future, GruLatent, Looks},
-    nn::{Activation, Buffer, GroupNormMish, Gru, LayerNorm, Params, Precision, Value, conv1d::ConvLayer},
+    nn::{Buffer, Form, Layer, Params, Precision, Value},
     noise::Philox,
     trajectory::Layout,
 };
@@ -158,7 +158,7 @@ fn rounds<V: Value>(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier
     (0..count).map(round).collect()
 }
 
-/// A buffer on which only matrix products do any work.
+/// A buffer on which only matrix products do any work: what would be done in place is left out.
 #[derive(Clone)]
 struct Bare(Buffer);
 
@@ -171,68 +171,18 @@ impl Value for Bare {
         self.0.shape()
     }
 
-    fn conv(&self, layer: &ConvLayer) -> Result<Self> {
-        self.0.conv(layer).map(Self)
-    }
-
-    fn gru(&self, layer: &Gru, before: Option<&Self>) -> Result<Self> {
-        self.0.gru(layer, before.map(|before| &before.0)).map(Self)
-    }
-
-    fn attention(&self, heads: usize) -> Result<Self> {
-        self.0.attention(heads).map(Self)
-    }
-
-    fn layer_norm(&self, _: &LayerNorm) -> Result<Self> {
-        Ok(self.clone())
-    }
-
-    fn group_norm_mish(self, _: &GroupNormMish) -> Result<Self> {
-        Ok(self)
-    }
-
-    fn activated(self, _: Activation) -> Result<Self> {
-        Ok(self)
-    }
-
-    fn plus(self, _: &Self) -> Result<Self> {
-        Ok(self)
-    }
-
-    fn plus_at_each_step(self, _: &Self) -> Result<Self> {
-        Ok(self)
-    }
-
-    fn modulated(self, _: &Self) -> Result<Self> {
-        Ok(self)
-    }
-
-    fn plus_gated(self, _: &Self, _: &Self) -> Result<Self> {
-        Ok(self)
-    }
-
-    fn beside(parts: &[&Self]) -> Result<Self> {
-        match parts {
-            [a, b] => Buffer::beside(&[&a.0, &b.0]).map(Self),
-            [a, b, c] => Buffer::beside(&[&a.0, &b.0, &c.0]).map(Self),
+    fn run(&self, layer: &Layer, others: &[&Self]) -> Result<Self> {
+        match others {
+            _ if layer.op().form() != Form::Anew => Ok(self.clone()),
+            [] => self.0.run(layer, &[]).map(Self),
+            [a] => self.0.run(layer, &[&a.0]).map(Self),
+            [a, b] => self.0.run(layer, &[&a.0, &b.0]).map(Self),
             _ => candle_core::bail!("the denoiser puts two or three side by side"),
         }
     }
 
-    fn channels(&self, start: usize, len: usize) -> Result<Self> {
-        self.0.channels(start, len).map(Self)
-    }
-
-    fn step(&self, index: usize) -> Result<Self> {
-        self.0.step(index).map(Self)
-    }
-
-    fn or_absent(self, _: &Self, _: &Tensor) -> Result<Self> {
-        Ok(self)
-    }
-
-    fn clamped(self, _: f32, _: f32) -> Result<Self> {
-        Ok(self)
+    fn run_in_place(self, layer: &Layer, others: &[&Self]) -> Result<Self> {
+        if layer.op().form() == Form::Anew { self.run(layer, others) } else { Ok(self) }
     }
 }
 

@@ -4,13 +4,14 @@ use super::{Gaussian, Tokens};
 use crate::model::{
     method::GruLatent,
     nn::{
+        Absent,
         Activation::Relu,
         Gru, Linear, Value,
         params::{Init, Params},
     },
     trajectory::Layout,
 };
-use candle_core::{Result, Tensor};
+use candle_core::Result;
 
 const STATE_WIDTH: usize = 32;
 const ACTION_WIDTH: usize = 16;
@@ -22,12 +23,12 @@ pub(super) const LOG_VAR: (f32, f32) = (-8.0, 2.0);
 /// One part of a token: a ReLU layer where present, a learned vector where absent.
 struct Part {
     embed: Linear,
-    absent: Tensor,
+    absent: Absent,
 }
 
 impl Part {
     fn new(d_in: usize, width: usize, params: &Params) -> Result<Self> {
-        Ok(Self { embed: Linear::new(d_in, width, params)?, absent: params.get(width, "absent", Init::Normal(0.1))? })
+        Ok(Self { embed: Linear::new(d_in, width, params)?, absent: Absent::new(width, Init::Normal(0.1), params)? })
     }
 
     /// `value` (B, L, d_in), `present` (B, L, 1) of 0 or 1.

@@ -2,20 +2,16 @@
 //! been seen.
 
 use super::{
-    conv1d::ConvLayer,
-    gru::Gru,
-    host::values,
-    kernels::{
-        activation::{self, Activation},
-        attention::Attention,
-        join,
-        pool::Pooled,
-    },
-    norm::{GroupNormMish, LayerNorm},
+    kernels::pool::Pooled,
+    layer::Layer,
+    op::{Form, View},
     value::Value,
 };
-use candle_core::{Result, Tensor, bail};
+use candle_core::{Result, bail};
 use std::ops::{Deref, DerefMut};
+
+/// Inputs of an operation.
+const INPUTS_MAX: usize = 8;
 
 /// `(batch, steps, channels)` numbers.
 #[derive(Clone, Debug)]
@@ -25,21 +21,19 @@ pub struct Buffer {
 }
 
 impl Buffer {
-    /// With any content.
-    fn take(shape: [usize; 3]) -> Self {
-        Self { values: Pooled::take(shape.iter().product()), shape }
+    fn view(&self) -> View<'_> {
+        View { values: &self.values, shape: self.shape }
     }
+}
 
-    fn width(&self) -> usize {
-        self.shape[2]
+/// Inputs one after the other, and how many.
+fn inputs<'a>(first: View<'a>, others: &[&'a Buffer]) -> Result<([View<'a>; INPUTS_MAX], usize)> {
+    let (mut inputs, count) = ([first; INPUTS_MAX], 1 + others.len());
+    if count > INPUTS_MAX {
+        bail!("{count} inputs, at most {INPUTS_MAX}");
     }
-
-    fn expect(&self, shape: [usize; 3]) -> Result<()> {
-        if self.shape != shape {
-            bail!("expected {shape:?}, got {:?}", self.shape);
-        }
-        Ok(())
-    }
+    inputs[1..].iter_mut().zip(others).for_each(|(input, other)| *input = other.view());
+    Ok((inputs, count))
 }
 
 impl Deref for Buffer {
@@ -67,131 +61,24 @@ impl Value for Buffer {
         Ok(self.shape)
     }
 
-    fn conv(&self, layer: &ConvLayer) -> Result<Self> {
-        let mut out = Self::take(layer.result_shape(self.shape)?);
-        layer.run(self, self.shape, &mut out.values)?;
-        Ok(out)
-    }
-
-    fn gru(&self, layer: &Gru, before: Option<&Self>) -> Result<Self> {
-        let ([batch, steps, _], hidden) = (self.shape, layer.hidden());
-        let zeros;
-        let before = if let Some(before) = before {
-            before.expect([batch, 1, hidden])?;
-            &before.values
-        } else {
-            zeros = Pooled::zeros(batch * hidden);
-            &zeros
-        };
-        let (projected, mut out) = (self.conv(&layer.inputs)?, Self::take([batch, steps, hidden]));
-        layer.run(&projected, before, batch, &mut out.values)?;
-        Ok(out)
-    }
-
-    fn attention(&self, heads: usize) -> Result<Self> {
-        let [batch, steps, width] = self.shape;
-        if heads == 0 || !width.is_multiple_of(3 * heads) {
-            bail!("{width} channels are not q, k, v of {heads} heads");
+    fn run(&self, layer: &Layer, others: &[&Self]) -> Result<Self> {
+        if layer.op.form() != Form::Anew {
+            return self.clone().run_in_place(layer, others);
         }
-        let mut out = Self::take([batch, steps, width / 3]);
-        Attention { batch, steps, heads, head_dim: width / (3 * heads) }.forward(self, &mut out.values);
-        Ok(out)
+        let (inputs, count) = inputs(self.view(), others)?;
+        let shape = layer.op.shape(&inputs[..count])?;
+        let mut values = Pooled::take(shape.iter().product());
+        layer.weights.with(|weights| layer.op.forward(&inputs[..count], weights, &mut values))?;
+        Ok(Self { values, shape })
     }
 
-    fn layer_norm(&self, layer: &LayerNorm) -> Result<Self> {
-        let mut out = self.clone();
-        layer.run(&mut out.values, self.width())?;
-        Ok(out)
-    }
-
-    fn group_norm_mish(mut self, layer: &GroupNormMish) -> Result<Self> {
-        let [_, steps, channels] = self.shape;
-        layer.run(&mut self.values, steps, channels)?;
-        Ok(self)
-    }
-
-    fn activated(mut self, activation: Activation) -> Result<Self> {
-        activation::in_place(activation, &mut self.values);
-        Ok(self)
-    }
-
-    fn plus(mut self, other: &Self) -> Result<Self> {
-        other.expect(self.shape)?;
-        join::add(&mut self.values, other);
-        Ok(self)
-    }
-
-    fn plus_at_each_step(mut self, e: &Self) -> Result<Self> {
-        let [batch, steps, channels] = self.shape;
-        e.expect([batch, 1, channels])?;
-        let items = self.values.chunks_exact_mut((steps * channels).max(1)).zip(e.chunks_exact(channels.max(1)));
-        items.for_each(|(item, e)| join::add_to_rows(e, item));
-        Ok(self)
-    }
-
-    fn modulated(mut self, ada: &Self) -> Result<Self> {
-        let [batch, steps, channels] = self.shape;
-        ada.expect([batch, steps, 2 * channels])?;
-        join::modulate(&mut self.values, ada, channels);
-        Ok(self)
-    }
-
-    fn plus_gated(mut self, h: &Self, gate: &Self) -> Result<Self> {
-        h.expect(self.shape)?;
-        gate.expect(self.shape)?;
-        join::add_gated(&mut self.values, h, gate);
-        Ok(self)
-    }
-
-    fn beside(parts: &[&Self]) -> Result<Self> {
-        let Some(first) = parts.first() else { bail!("nothing to put side by side") };
-        let [batch, steps, _] = first.shape;
-        if let Some(other) = parts.iter().find(|part| part.shape[..2] != [batch, steps]) {
-            bail!("cannot put {:?} and {:?} side by side", first.shape, other.shape);
+    fn run_in_place(mut self, layer: &Layer, others: &[&Self]) -> Result<Self> {
+        if layer.op.form() == Form::Anew {
+            return self.run(layer, others);
         }
-        let width = parts.iter().map(|part| part.width()).sum();
-        let (mut out, mut start) = (Self::take([batch, steps, width]), 0);
-        for part in parts {
-            join::copy_columns(part, part.width(), (&mut out.values[start..], width), part.width());
-            start += part.width();
-        }
-        Ok(out)
-    }
-
-    fn channels(&self, start: usize, len: usize) -> Result<Self> {
-        if start + len > self.width() {
-            bail!("{:?} has no channels {start}..{}", self.shape, start + len);
-        }
-        let mut out = Self::take([self.shape[0], self.shape[1], len]);
-        join::copy_columns(&self.values[start.min(self.values.len())..], self.width(), (&mut out.values, len), len);
-        Ok(out)
-    }
-
-    fn step(&self, index: usize) -> Result<Self> {
-        let [batch, steps, channels] = self.shape;
-        if index >= steps {
-            bail!("{:?} has no step {index}", self.shape);
-        }
-        let mut out = Self::take([batch, 1, channels]);
-        join::copy_columns(&self.values[index * channels..], steps * channels, (&mut out.values, channels), channels);
-        Ok(out)
-    }
-
-    fn or_absent(mut self, present: &Self, absent: &Tensor) -> Result<Self> {
-        present.expect([self.shape[0], self.shape[1], 1])?;
-        let (absent, width) = (values(absent)?, self.width());
-        if absent.len() != width {
-            bail!("an absent part of {} channels for {:?}", absent.len(), self.shape);
-        }
-        let rows = self.values.chunks_exact_mut(width.max(1)).zip(present.values.iter());
-        for (row, &present) in rows {
-            row.iter_mut().zip(absent.iter()).for_each(|(x, absent)| *x = *x * present + (1.0 - present) * absent);
-        }
-        Ok(self)
-    }
-
-    fn clamped(mut self, low: f32, high: f32) -> Result<Self> {
-        self.values.iter_mut().for_each(|x| *x = x.clamp(low, high));
+        let (inputs, count) = inputs(View { values: &[], shape: self.shape }, others)?;
+        layer.op.shape(&inputs[..count])?;
+        layer.weights.with(|weights| layer.op.forward(&inputs[..count], weights, &mut self.values))?;
         Ok(self)
     }
 }

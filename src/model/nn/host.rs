@@ -51,8 +51,3 @@ fn contiguous_range(layout: &Layout) -> Result<(usize, usize)> {
 pub(super) fn output(values: Vec<f32>, shape: impl Into<Shape>) -> Result<(CpuStorage, Shape)> {
     Ok((CpuStorage::F32(values), shape.into()))
 }
-
-/// A gradient: a tensor like `like`.
-pub(super) fn grad_like(values: Vec<f32>, like: &Tensor) -> Result<Option<Tensor>> {
-    Tensor::from_vec(values, like.shape(), like.device()).map(Some)
-}

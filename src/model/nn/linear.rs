@@ -1,15 +1,16 @@
 //! The fully connected layer, PyTorch's `nn.Linear`.
 
 use super::{
-    conv1d::ConvLayer,
+    conv1d::Conv,
+    layer::Layer,
     params::{Init, Params},
     value::Value,
 };
 use candle_core::Result;
 
-/// `y = x W^T + b` over the last dimension.
+/// `y = x W^T + b` over the channels.
 #[derive(Clone, Debug)]
-pub struct Linear(ConvLayer);
+pub struct Linear(Layer);
 
 impl Linear {
     /// `weight` `(d_out, d_in)` and `bias` `(d_out)`, both uniform in `+-1/sqrt(d_in)` when fresh.
@@ -26,7 +27,7 @@ impl Linear {
     /// Those of [`Params::get`].
     pub fn with_init(d_in: usize, d_out: usize, weight: Init, bias: Init, p: &Params) -> Result<Self> {
         let (weight, bias) = (p.get((d_out, d_in), "weight", weight)?, p.get(d_out, "bias", bias)?);
-        ConvLayer::linear(weight, bias, p).map(Self)
+        Conv::linear(d_in, d_out).layer(weight, bias, p).map(Self)
     }
 
     /// A layer that is used in parts: one parameter pair, `weight` `(sum of widths, d_in)` and its `bias`, as one layer for each width.
@@ -39,16 +40,17 @@ impl Linear {
         let mut layers = Vec::with_capacity(N);
         for (i, width) in widths.into_iter().enumerate() {
             let start = widths[..i].iter().sum();
-            layers.push(Self(ConvLayer::linear(weight.narrow(0, start, width)?, bias.narrow(0, start, width)?, p)?));
+            let (weight, bias) = (weight.narrow(0, start, width)?, bias.narrow(0, start, width)?);
+            layers.push(Self(Conv::linear(d_in, width).layer(weight, bias, p)?));
         }
         layers.try_into().map_err(|_| candle_core::Error::Msg("as many layers as widths: is a bug".into()))
     }
 
-    /// `(.., d_in)` to `(.., d_out)`.
+    /// `(B, T, d_in)` to `(B, T, d_out)`.
     ///
     /// # Errors
-    /// If the last dimension of `x` is not `d_in`.
+    /// If `x` has another rank or number of channels.
     pub fn forward<V: Value>(&self, x: &V) -> Result<V> {
-        x.conv(&self.0)
+        x.run(&self.0, &[])
     }
 }

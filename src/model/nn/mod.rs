@@ -1,23 +1,25 @@
 //! Layers with checked forward and backward, over plain-slice kernels.
 //!
-//! Activations are f32 on the CPU, channels last: `(batch, time, channels)`; weights have PyTorch's names and layouts. Networks are
-//! written over any [`Value`]: on candle's tensors each layer is an operation with its own backward (training), on [`Buffer`]s the same
-//! kernels run without allocating (inference). In a frozen store ([`Params::frozen`]) weights are packed once, at construction. A row's
-//! bits do not depend on the batch around it (see [`kernels`]).
+//! Activations are f32 on the CPU, channels last: `(batch, time, channels)`; weights have PyTorch's names and layouts. What is computed
+//! is one list of operations, [`Op`], each with its shape, forward and backward over [`kernels`]; a [`Layer`] is an operation with its
+//! parameters. Networks are written over any [`Value`], which runs them: candle's tensors with a way back (training), [`Buffer`]s without
+//! allocating (inference). In a frozen store ([`Params::frozen`]) weights are packed once, at construction, and not held otherwise. A
+//! row's bits do not depend on the batch around it (see [`kernels`]).
 
-mod activation;
-mod attention;
+mod absent;
 mod buffer;
 #[cfg(test)]
 mod candle_faults;
 pub mod conv1d;
 pub mod gru;
 pub mod host;
-mod join;
 pub mod kernels;
+mod layer;
 pub mod linear;
 pub mod norm;
+mod op;
 pub mod params;
+mod tensor;
 #[cfg(test)]
 mod testing;
 #[cfg(test)]
@@ -25,12 +27,15 @@ mod tests;
 pub mod time_embedding;
 mod value;
 
+pub use absent::Absent;
 pub use buffer::Buffer;
 pub use conv1d::{Conv1d, ConvShape, ConvTranspose1d};
 pub use gru::Gru;
 pub use kernels::{activation::Activation, product::Precision};
+pub use layer::{Layer, WeightRef, WeightsRef};
 pub use linear::Linear;
 pub use norm::{GroupNormMish, LayerNorm};
+pub use op::{Form, Op, Past, Slot, View};
 pub use params::{Init, Params};
 pub use value::Value;
 

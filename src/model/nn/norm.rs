@@ -1,53 +1,20 @@
 //! Group norm with Mish (one operation, as the U-Net always has them in a row) and layer norm.
 
 use super::{
-    conv1d::Grads3,
-    host::{grad_like, output, slice, values},
-    kernels::norm::{self, Norm},
+    kernels::{
+        norm::{self, Norm, NormGrads},
+        pool::Pooled,
+    },
+    layer::{Layer, Weight, WeightsRef},
+    op::{Op, Past, Slot},
     params::{Init, Params},
     value::Value,
 };
-use candle_core::{CpuStorage, CustomOp3, Device, Layout, Result, Shape, Tensor};
-use std::sync::Arc;
+use candle_core::{Device, Result, Tensor, bail};
 
 /// `mish(group_norm(x))` on `(B, T, C)`: PyTorch's `nn.GroupNorm` (on `(B, C, T)`), then `nn.Mish`.
 #[derive(Clone, Debug)]
-pub struct GroupNormMish {
-    affine: Affine,
-    groups: usize,
-}
-
-/// Scale and shift by channel.
-#[derive(Clone, Debug)]
-struct Affine {
-    weight: Tensor,
-    bias: Tensor,
-    /// The same as plain numbers, where they are constant.
-    held: Option<Arc<[Vec<f32>; 2]>>,
-}
-
-impl Affine {
-    fn new(weight: Tensor, bias: Tensor, p: &Params) -> Result<Self> {
-        let held = p.frozen().map(|_| Ok::<_, candle_core::Error>(Arc::new([values(&weight)?.to_vec(), values(&bias)?.to_vec()])));
-        let held = held.transpose()?;
-        Ok(Self { weight, bias, held })
-    }
-
-    fn apply(&self, norm: Norm, x: &Tensor) -> Result<Tensor> {
-        x.contiguous()?.apply_op3(&self.weight, &self.bias, NormOp(norm))
-    }
-
-    fn run(&self, norm: Norm, x: &mut [f32]) -> Result<()> {
-        if norm.channels != self.weight.elem_count() {
-            candle_core::bail!("a norm of {} channels got {}", self.weight.elem_count(), norm.channels);
-        }
-        match &self.held {
-            Some(held) => norm::in_place(norm, x, &held[0], &held[1]),
-            None => norm::in_place(norm, x, &values(&self.weight)?, &values(&self.bias)?),
-        }
-        Ok(())
-    }
-}
+pub struct GroupNormMish(Layer);
 
 impl GroupNormMish {
     /// `weight` (1 when fresh) and `bias` (0), both `(channels)`; eps is 1e-5.
@@ -56,10 +23,10 @@ impl GroupNormMish {
     /// Those of [`Params::get`], or if the groups do not divide the channels.
     pub fn new(groups: usize, channels: usize, p: &Params) -> Result<Self> {
         if groups == 0 || !channels.is_multiple_of(groups) {
-            candle_core::bail!("{groups} groups do not divide {channels} channels");
+            bail!("{groups} groups do not divide {channels} channels");
         }
         let (weight, bias) = (p.get(channels, "weight", Init::Const(1.0))?, p.get(channels, "bias", Init::Const(0.0))?);
-        Ok(Self { affine: Affine::new(weight, bias, p)?, groups })
+        NormKind { channels, groups, eps: 1e-5, over_time: true, mish: true }.layer(weight, bias, p).map(Self)
     }
 
     /// `(B, T, C)` to the same shape; statistics of an item run over the channels of a group and over time.
@@ -67,31 +34,13 @@ impl GroupNormMish {
     /// # Errors
     /// If `x` has another rank or number of channels.
     pub fn forward<V: Value>(&self, x: V) -> Result<V> {
-        x.group_norm_mish(self)
-    }
-
-    fn norm(&self, steps: usize, channels: usize) -> Norm {
-        Norm { steps, channels, groups: self.groups, eps: 1e-5, mish: true }
-    }
-
-    /// On candle's tensors, with a way back.
-    pub(super) fn apply(&self, x: &Tensor) -> Result<Tensor> {
-        let (_, steps, channels) = x.dims3()?;
-        self.affine.apply(self.norm(steps, channels), x)
-    }
-
-    /// On plain numbers, in place.
-    pub(super) fn run(&self, x: &mut [f32], steps: usize, channels: usize) -> Result<()> {
-        self.affine.run(self.norm(steps, channels), x)
+        x.run_in_place(&self.0, &[])
     }
 }
 
-/// PyTorch's `nn.LayerNorm` over the last dimension.
+/// PyTorch's `nn.LayerNorm` over the channels.
 #[derive(Clone, Debug)]
-pub struct LayerNorm {
-    affine: Affine,
-    eps: f32,
-}
+pub struct LayerNorm(Layer);
 
 impl LayerNorm {
     /// With `affine`: `weight` (1 when fresh) and `bias` (0), both `(dim)`; without: no parameters.
@@ -105,65 +54,51 @@ impl LayerNorm {
         } else {
             (Tensor::from_vec(vec![1.0_f32; dim], dim, &Device::Cpu)?, Tensor::from_vec(vec![0.0_f32; dim], dim, &Device::Cpu)?)
         };
-        Ok(Self { affine: Affine::new(weight, bias, p)?, eps: eps as f32 })
+        NormKind { channels: dim, groups: 1, eps: eps as f32, over_time: false, mish: false }.layer(weight, bias, p).map(Self)
     }
 
-    /// `(.., dim)` to the same shape.
+    /// `(B, T, dim)` to the same shape.
     ///
     /// # Errors
-    /// If the last dimension of `x` is not `dim`.
+    /// If `x` has another rank or number of channels.
     pub fn forward<V: Value>(&self, x: &V) -> Result<V> {
-        x.layer_norm(self)
-    }
-
-    fn norm(&self, channels: usize) -> Norm {
-        Norm { steps: 1, channels, groups: 1, eps: self.eps, mish: false }
-    }
-
-    /// On candle's tensors, with a way back.
-    pub(super) fn apply(&self, x: &Tensor) -> Result<Tensor> {
-        self.affine.apply(self.norm(x.dims().last().copied().unwrap_or(0)), x)
-    }
-
-    /// On plain numbers, in place.
-    pub(super) fn run(&self, x: &mut [f32], channels: usize) -> Result<()> {
-        self.affine.run(self.norm(channels), x)
+        x.run(&self.0, &[])
     }
 }
 
-/// A normalisation as an operation on (x, weight, bias).
-struct NormOp(Norm);
+/// A normalisation of windows of any length.
+#[derive(Clone, Copy, Debug)]
+pub struct NormKind {
+    /// Channels of a step.
+    pub(super) channels: usize,
+    groups: usize,
+    eps: f32,
+    /// Whether statistics run over all steps of an item, or each step has its own.
+    over_time: bool,
+    mish: bool,
+}
 
-impl CustomOp3 for NormOp {
-    fn name(&self) -> &'static str {
-        "norm"
+impl NormKind {
+    fn layer(self, weight: Tensor, bias: Tensor, p: &Params) -> Result<Layer> {
+        Layer::new(Op::Norm(self), weight, Some(bias), p, |weight| Weight::Plain(weight.to_vec()))
     }
 
-    fn cpu_fwd(
-        &self,
-        s1: &CpuStorage,
-        l1: &Layout,
-        s2: &CpuStorage,
-        l2: &Layout,
-        s3: &CpuStorage,
-        l3: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (x, weight, bias) = (slice(s1, l1)?, slice(s2, l2)?, slice(s3, l3)?);
-        if self.0.channels != weight.len() {
-            candle_core::bail!("a norm of {} channels got {:?}", weight.len(), l1.shape());
-        }
-        let mut out = x.to_vec();
-        norm::in_place(self.0, &mut out, weight, bias);
-        output(out, l1.shape())
+    fn at(self, steps: usize) -> Norm {
+        let Self { channels, groups, eps, over_time, mish } = self;
+        Norm { steps: if over_time { steps } else { 1 }, channels, groups, eps, mish }
     }
 
-    fn bwd(&self, x: &Tensor, weight: &Tensor, bias: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Grads3> {
-        let grad = grad.contiguous()?;
-        let grads = norm::backward(self.0, &values(x)?, (&values(weight)?, &values(bias)?), &values(&grad)?);
-        let dx = grad_like(grads.x, x)?;
-        if !weight.track_op() {
-            return Ok((dx, None, None));
-        }
-        Ok((dx, grad_like(grads.weight, weight)?, grad_like(grads.bias, bias)?))
+    pub(super) fn forward(self, steps: usize, weights: WeightsRef, x: &mut [f32]) -> Result<()> {
+        norm::in_place(self.at(steps), x, weights.plain()?, weights.bias);
+        Ok(())
+    }
+
+    pub(super) fn backward(self, past: &Past, to: &mut [Slot]) -> Result<()> {
+        let ([x], [dx, weight, bias]) = (past.inputs, to) else { bail!("a norm has one input and two parameters") };
+        // The gradient to `x` is on the way to the others, whether anybody wants it or not.
+        let mut spare = Pooled::copy_of(if dx.is_some() { &[] } else { past.grad });
+        let grads = NormGrads { x: dx.as_deref_mut().unwrap_or(&mut spare), weight: weight.as_deref_mut(), bias: bias.as_deref_mut() };
+        norm::backward(self.at(x.shape[1]), x.values, (past.weights.plain()?, past.weights.bias), grads);
+        Ok(())
     }
 }

@@ -22,13 +22,13 @@ pub enum Init {
 enum Source {
     Fresh { seed: u64, vars: BTreeMap<String, Var> },
     Counted { sizes: BTreeMap<String, usize> },
-    Loaded { tensors: BTreeMap<String, Tensor>, used: BTreeSet<String>, precision: Precision },
+    Loaded { tensors: BTreeMap<String, Tensor>, used: BTreeSet<String>, frozen: Option<Precision> },
 }
 
 /// A scope in a parameter store: `params.scope("down").scope("0").get(&[32, 23, 5], "weight", init)` is the tensor `down.0.weight`.
 ///
 /// In a *fresh* store every parameter is a trainable variable, drawn from the seed and its own name (so adding a layer does not
-/// move the others). In a *loaded* store parameters are constants: layers may pack them once.
+/// move the others). In a *loaded* store parameters are constants: layers pack them once, and keep no other copy.
 #[derive(Clone)]
 pub struct Params {
     source: Arc<Mutex<Source>>,
@@ -53,7 +53,15 @@ impl Params {
 
     /// A store of constants whose weight matrices are held with this precision; biases and norms stay as they are.
     pub fn loaded_as(tensors: BTreeMap<String, Tensor>, precision: Precision) -> Self {
-        Self { source: Arc::new(Mutex::new(Source::Loaded { tensors, used: BTreeSet::new(), precision })), prefix: String::new() }
+        let source = Source::Loaded { tensors, used: BTreeSet::new(), frozen: Some(precision) };
+        Self { source: Arc::new(Mutex::new(source)), prefix: String::new() }
+    }
+
+    /// A store of these tensors as they are: gradients go through layers to them.
+    #[cfg(test)]
+    pub(super) fn given(tensors: BTreeMap<String, Tensor>) -> Self {
+        let source = Source::Loaded { tensors, used: BTreeSet::new(), frozen: None };
+        Self { source: Arc::new(Mutex::new(source)), prefix: String::new() }
     }
 
     /// The same store, one name deeper.
@@ -62,11 +70,11 @@ impl Params {
         Self { source: self.source.clone(), prefix }
     }
 
-    /// If the parameters are constants (inference), so that a layer may pack them at construction: how it is to hold its weights.
+    /// If the parameters are constants (inference), so that a layer packs them at construction: how it is to hold its weights.
     pub fn frozen(&self) -> Option<Precision> {
         match &*self.lock() {
             Source::Fresh { .. } | Source::Counted { .. } => None,
-            Source::Loaded { precision, .. } => Some(*precision),
+            Source::Loaded { frozen, .. } => *frozen,
         }
     }
 

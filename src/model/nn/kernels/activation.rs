@@ -3,7 +3,7 @@
 use super::{math, per_isa};
 
 /// A non-linearity.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Activation {
     /// `x tanh(softplus(x))`.
     Mish,
@@ -13,6 +13,8 @@ pub enum Activation {
     GeluTanh,
     /// `max(x, 0)`.
     Relu,
+    /// Held between bounds, the lower first.
+    Clamp(f32, f32),
 }
 
 per_isa! {
@@ -23,6 +25,7 @@ per_isa! {
             Activation::Silu => x.iter_mut().for_each(|x| *x = math::silu(*x)),
             Activation::GeluTanh => x.iter_mut().for_each(|x| *x = math::gelu(*x)),
             Activation::Relu => x.iter_mut().for_each(|x| *x = if *x < 0.0 { 0.0 } else { *x }),
+            Activation::Clamp(low, high) => x.iter_mut().for_each(|x| *x = x.clamp(low, high)),
         }
     }
 }
@@ -35,6 +38,13 @@ per_isa! {
             Activation::Silu => grad.iter_mut().zip(x).for_each(|(grad, &x)| *grad *= math::silu_derivative(x)),
             Activation::GeluTanh => grad.iter_mut().zip(x).for_each(|(grad, &x)| *grad *= math::gelu_derivative(x)),
             Activation::Relu => grad.iter_mut().zip(x).for_each(|(grad, &x)| *grad = if x > 0.0 { *grad } else { 0.0 }),
+            Activation::Clamp(low, high) => grad.iter_mut().zip(x).for_each(|(grad, &x)| *grad *= between(x, low, high)),
         }
     }
+}
+
+/// 1 inside of the bounds, 0 outside, and a half on them, between the slopes of both sides.
+#[inline(always)]
+fn between(x: f32, low: f32, high: f32) -> f32 {
+    0.5 * (f32::from(x > low) + f32::from(x >= low)) * 0.5 * (f32::from(x < high) + f32::from(x <= high))
 }

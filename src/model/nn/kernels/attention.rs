@@ -126,9 +126,8 @@ impl Attention {
         }
     }
 
-    /// The gradient to `qkv` from `grad`, the gradient to the result.
-    pub fn backward(&self, qkv: &[f32], grad: &[f32]) -> Vec<f32> {
-        let mut out = vec![0.0; qkv.len()];
+    /// The gradient to `qkv` into `out`, from `grad`, the gradient to the result.
+    pub fn backward(&self, qkv: &[f32], grad: &[f32], out: &mut [f32]) {
         let (mut weights, mut scores) = (Pooled::take(self.steps * self.steps), Pooled::take(self.steps * self.steps));
         let stride = 3 * self.width();
         for at in self.each_head() {
@@ -142,6 +141,5 @@ impl Attention {
             self.square(&scores).times(&key, &mut out[self.offset(at.0, at.1, Part::Query)..], stride);
             self.square(&scores).transposed_times(&query, &mut out[self.offset(at.0, at.1, Part::Key)..], stride);
         }
-        out
     }
 }

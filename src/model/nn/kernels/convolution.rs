@@ -48,6 +48,12 @@ pub struct Convolution {
 pub struct Phases(Vec<Packed>);
 
 impl Phases {
+    /// The same in memory of their own, to be kept.
+    #[must_use]
+    pub fn kept(self) -> Self {
+        Self(self.0.into_iter().map(Packed::kept).collect())
+    }
+
     /// The same weights, held with this precision.
     #[must_use]
     pub fn held_as(self, precision: Precision) -> Self {
@@ -56,14 +62,14 @@ impl Phases {
 }
 
 impl ConvShape {
-    /// The weights for [`Convolution::gather`], to be kept.
+    /// The weights for [`Convolution::gather`] of any work.
     pub fn pack_gather(&self, weight: &[f32]) -> Packed {
-        self.gather_weights(weight, 0..self.kernel).kept()
+        self.gather_weights(weight, 0..self.kernel)
     }
 
-    /// The weights for [`Convolution::spread`], to be kept.
+    /// The weights for [`Convolution::spread`] of any work.
     pub fn pack_spread(&self, weight: &[f32]) -> Phases {
-        Phases(self.spread_weights(weight).0.into_iter().map(Packed::kept).collect())
+        self.spread_weights(weight)
     }
 
     /// The weights of these taps for [`Convolution::gather`], in memory of the pool; those of the others are not filled.
@@ -160,17 +166,16 @@ impl Convolution {
         }
     }
 
-    /// The gradient to the weights: `dw[o, c, tap] = sum over b, t of x[b, t stride + tap - padding, c] dy[b, t, o]`. Chains run over
+    /// The gradient to the weights into `out`: `dw[o, c, tap] = sum over b, t of x[b, t stride + tap - padding, c] dy[b, t, o]`. Chains run over
     /// time, then items, so that a tap skips the times at which it falls on padding.
-    pub fn weight_grad(&self, x: &[f32], dy: &[f32]) -> Vec<f32> {
+    pub fn weight_grad(&self, x: &[f32], dy: &[f32], out: &mut [f32]) {
         let ConvShape { c_in, c_out, kernel, stride, padding } = self.shape;
         let (batch, steps, narrow_steps) = (self.batch, self.padded_steps(), self.narrow_steps);
         if self.shape.is_pointwise() {
             // Without taps the product can be taken the other way round, which gives the weights' own layout.
-            let (count, mut out) = (batch * narrow_steps, vec![0.0; c_out * c_in]);
+            let count = batch * narrow_steps;
             let packed = Packed::scratch(x, (Every(c_in), count), (c_in, 1));
-            product(Left { values: dy, terms: Every(c_out) }, &packed, Start::Zero, &mut out, even_rows(c_out, 1, c_in, count));
-            return out;
+            return product(Left { values: dy, terms: Every(c_out) }, &packed, Start::Zero, out, even_rows(c_out, 1, c_in, count));
         }
         let by_time = |window: usize, step: usize| -> Vec<usize> {
             (0..narrow_steps).flat_map(|t| (0..batch).map(move |b| b * window + t * step)).collect()
@@ -193,7 +198,7 @@ impl Convolution {
         });
         product(Left { values, terms: Table(&windows) }, &packed, Start::Zero, &mut transposed, rows);
         let order: Vec<usize> = (0..c_in).flat_map(|c| (0..kernel).map(move |tap| tap * c_in + c)).collect();
-        join::transpose(&transposed, c_out, &order)
+        join::transpose(&transposed, c_out, &order, out);
     }
 
     /// Steps of a padded window.

@@ -30,16 +30,16 @@ pub struct GruRun<'a> {
     pub states: &'a [f32],
 }
 
-/// What backward gives.
-pub struct GruGrads {
+/// Where backward writes; it finds zeros.
+pub struct GruGrads<'a> {
     /// To the projected inputs, `(batch, steps, 3 hidden)`.
-    pub inputs: Vec<f32>,
+    pub inputs: &'a mut [f32],
     /// To the initial state, `(batch, hidden)`.
-    pub initial: Vec<f32>,
-    /// To the recurrent weights, `(3 hidden, hidden)`.
-    pub weight: Vec<f32>,
-    /// To the recurrent bias, `(3 hidden)`.
-    pub bias: Vec<f32>,
+    pub initial: &'a mut [f32],
+    /// To the recurrent weights, `(3 hidden, hidden)`, if wanted.
+    pub weight: Option<&'a mut [f32]>,
+    /// To the recurrent bias, `(3 hidden)`, if wanted.
+    pub bias: Option<&'a mut [f32]>,
 }
 
 per_isa! {
@@ -119,41 +119,42 @@ impl Gru {
     }
 
     /// The state before each step, `(batch, steps, hidden)`.
-    fn states_before(&self, run: GruRun) -> Vec<f32> {
-        let mut before = Vec::with_capacity(run.states.len());
-        for (initial, states) in run.initial.chunks_exact(self.hidden).zip(run.states.chunks_exact(self.steps * self.hidden)) {
-            before.extend_from_slice(initial);
-            before.extend_from_slice(&states[..states.len() - self.hidden]);
+    fn states_before(&self, run: GruRun) -> Pooled {
+        let (mut before, len) = (Pooled::take(run.states.len()), self.steps * self.hidden);
+        let items = run.initial.chunks_exact(self.hidden).zip(run.states.chunks_exact(len));
+        for ((initial, states), before) in items.zip(before.chunks_exact_mut(len)) {
+            let (first, rest) = before.split_at_mut(self.hidden);
+            first.copy_from_slice(initial);
+            rest.copy_from_slice(&states[..rest.len()]);
         }
         before
     }
 
     /// Gradients from `grad`, the gradient to the states of `run`; `recurrent` is (weight `(3 hidden, hidden)`, bias).
-    pub fn backward(&self, run: GruRun, recurrent: (&[f32], &[f32]), grad: &[f32]) -> GruGrads {
+    pub fn backward(&self, run: GruRun, recurrent: (&[f32], &[f32]), grad: &[f32], to: GruGrads) {
         let (size, row, count) = (self.hidden, 3 * self.hidden, self.batch * self.steps);
-        let before = self.states_before(run);
-        let mut projected = vec![0.0; count * row];
+        let (before, mut projected) = (self.states_before(run), Pooled::take(count * row));
         let forward = Packed::transposed(recurrent.0, size, (row, size), &Passes::one());
         let rows = even_rows(count, size, row, size);
         product(Left { values: &before, terms: InLine }, &forward, Start::Bias(recurrent.1), &mut projected, rows);
         let back = Packed::scratch(recurrent.0, (Every(size), row), (size, 1));
-        let (mut inputs, mut dh) = (vec![0.0; count * row], vec![0.0; self.batch * size]);
         for t in (0..self.steps).rev() {
             for b in 0..self.batch {
                 let at = b * self.steps + t;
-                let dh = &mut dh[b * size..][..size];
+                let dh = &mut to.initial[b * size..][..size];
                 dh.iter_mut().zip(&grad[at * size..][..size]).for_each(|(dh, grad)| *dh += grad);
-                let (p, dx) = (&mut projected[at * row..][..row], &mut inputs[at * row..][..row]);
+                let (p, dx) = (&mut projected[at * row..][..row], &mut to.inputs[at * row..][..row]);
                 step_back(StepBack { x: &run.inputs[at * row..][..row], p, h: &before[at * size..][..size], dx, dh });
             }
             let rows = (0..self.batch).map(|b| Row { from: (b * self.steps + t) * row, to: b * size, terms: 0..row });
-            product(Left { values: &projected, terms: InLine }, &back, Start::Out, &mut dh, rows);
+            product(Left { values: &projected, terms: InLine }, &back, Start::Out, to.initial, rows);
         }
-        let mut weight = vec![0.0; row * size];
-        let before = Packed::scratch(&before, (Every(size), count), (size, 1));
-        product(Left { values: &projected, terms: Every(row) }, &before, Start::Zero, &mut weight, even_rows(row, 1, size, count));
-        let mut bias = vec![0.0; row];
-        join::add_rows(&projected, row, &mut bias);
-        GruGrads { inputs, initial: dh, weight, bias }
+        if let Some(weight) = to.weight {
+            let before = Packed::scratch(&before, (Every(size), count), (size, 1));
+            product(Left { values: &projected, terms: Every(row) }, &before, Start::Zero, weight, even_rows(row, 1, size, count));
+        }
+        if let Some(bias) = to.bias {
+            join::add_rows(&projected, row, bias);
+        }
     }
 }

@@ -32,9 +32,9 @@ per_isa! {
 }
 
 per_isa! {
-    /// `x[i] *= y[i]`.
-    pub fn multiply(x: &mut [f32], y: &[f32]) {
-        x.iter_mut().zip(y).for_each(|(x, y)| *x *= y);
+    /// `out[i] = x[i] y[i]`.
+    pub fn products(x: &[f32], y: &[f32], out: &mut [f32]) {
+        out.iter_mut().zip(x.iter().zip(y)).for_each(|(out, (x, y))| *out = x * y);
     }
 }
 
@@ -56,41 +56,64 @@ per_isa! {
 }
 
 per_isa! {
-    /// Gradients of [`modulate`]: `dx` holds that of the result and becomes that of `x`; those of shift and scale are returned.
-    pub fn modulate_back(x: &[f32], dx: &mut [f32], ada: &[f32], channels: usize) -> Vec<f32> {
-        let mut d_ada = Vec::with_capacity(ada.len());
-        let rows = x.chunks_exact(channels).zip(dx.chunks_exact_mut(channels));
-        for ((x, dx), ada) in rows.zip(ada.chunks_exact(2 * channels)) {
-            d_ada.extend_from_slice(dx);
-            d_ada.extend(x.iter().zip(&*dx).map(|(x, dx)| x * dx));
+    /// From the gradient to [`modulate`]'s result to the one to `x`, in place.
+    pub fn modulate_back(dx: &mut [f32], ada: &[f32], channels: usize) {
+        for (dx, ada) in dx.chunks_exact_mut(channels).zip(ada.chunks_exact(2 * channels)) {
             dx.iter_mut().zip(&ada[channels..]).for_each(|(dx, scale)| *dx *= scale + 1.0);
         }
-        d_ada
     }
 }
 
-/// The first `columns` numbers of every row of `x` (`x_stride` apart) to the rows of `out` (with their own stride).
-pub fn copy_columns(x: &[f32], x_stride: usize, (out, out_stride): (&mut [f32], usize), columns: usize) {
-    for (x, out) in x.chunks(x_stride.max(1)).zip(out.chunks_mut(out_stride.max(1))) {
-        out[..columns].copy_from_slice(&x[..columns]);
+per_isa! {
+    /// The gradient to [`modulate`]'s shift and scale from the one to its result.
+    pub fn modulate_grad(x: &[f32], grad: &[f32], d_ada: &mut [f32], channels: usize) {
+        let rows = x.chunks_exact(channels).zip(grad.chunks_exact(channels));
+        for ((x, grad), d_ada) in rows.zip(d_ada.chunks_exact_mut(2 * channels)) {
+            let (d_shift, d_scale) = d_ada.split_at_mut(channels);
+            d_shift.copy_from_slice(grad);
+            d_scale.iter_mut().zip(x.iter().zip(grad)).for_each(|(d_scale, (x, grad))| *d_scale = x * grad);
+        }
     }
 }
 
-/// Rows of `widths[0] + widths[1]` numbers, parted.
-pub fn split(joined: &[f32], widths: [usize; 2]) -> [Vec<f32>; 2] {
-    let rows = joined.len() / (widths[0] + widths[1]);
-    let (mut a, mut b) = (Vec::with_capacity(rows * widths[0]), Vec::with_capacity(rows * widths[1]));
-    for row in joined.chunks_exact(widths[0] + widths[1]) {
-        a.extend_from_slice(&row[..widths[0]]);
-        b.extend_from_slice(&row[widths[0]..]);
+per_isa! {
+    /// Rows of `x` where `present` is 1, `absent` where it is 0.
+    pub fn or_absent(x: &mut [f32], present: &[f32], absent: &[f32]) {
+        for (row, &present) in x.chunks_exact_mut(absent.len().max(1)).zip(present) {
+            row.iter_mut().zip(absent).for_each(|(x, absent)| *x = *x * present + (1.0 - present) * absent);
+        }
     }
-    [a, b]
 }
 
-/// The rows of a matrix of `columns` columns, in the given order, as columns; block by block.
-pub fn transpose(matrix: &[f32], columns: usize, order: &[usize]) -> Vec<f32> {
+per_isa! {
+    /// Rows of `x` where `present` is 1, zeros where it is 0.
+    pub fn where_present(x: &mut [f32], present: &[f32]) {
+        for (row, &present) in x.chunks_exact_mut((x.len() / present.len().max(1)).max(1)).zip(present) {
+            row.iter_mut().for_each(|x| *x *= present);
+        }
+    }
+}
+
+per_isa! {
+    /// `out[c] += sum of x[row, c]` over the rows where `present` is 0, in ascending order.
+    pub fn add_rows_where_absent(x: &[f32], present: &[f32], out: &mut [f32]) {
+        for (row, &present) in x.chunks_exact(out.len().max(1)).zip(present) {
+            out.iter_mut().zip(row).for_each(|(out, x)| *out = (1.0 - present).mul_add(*x, *out));
+        }
+    }
+}
+
+/// Columns of `x` to columns of `out`, row by row; each is (numbers, width of a row, first column).
+pub fn copy_columns((x, x_width, from): (&[f32], usize, usize), (out, out_width, to): (&mut [f32], usize, usize), columns: usize) {
+    for (x, out) in x.chunks_exact(x_width.max(1)).zip(out.chunks_exact_mut(out_width.max(1))) {
+        out[to..to + columns].copy_from_slice(&x[from..from + columns]);
+    }
+}
+
+/// The rows of a matrix of `columns` columns, in the given order, as columns of `out`; block by block.
+pub fn transpose(matrix: &[f32], columns: usize, order: &[usize], out: &mut [f32]) {
     let rows = order.len();
-    let (mut out, mut strip) = (Vec::with_capacity(matrix.len()), Pooled::take(SIDE * rows));
+    let mut strip = Pooled::take(SIDE * rows);
     for column in (0..columns).step_by(SIDE) {
         let width = SIDE.min(columns - column);
         for (start, order) in order.chunks(SIDE).enumerate() {
@@ -99,7 +122,6 @@ pub fn transpose(matrix: &[f32], columns: usize, order: &[usize]) -> Vec<f32> {
                 strip[start * SIDE..][..order.len()].copy_from_slice(&turned[..order.len()]);
             }
         }
-        out.extend_from_slice(&strip[..width * rows]);
+        out[column * rows..][..width * rows].copy_from_slice(&strip[..width * rows]);
     }
-    out
 }

@@ -20,14 +20,14 @@ pub struct Norm {
     pub mish: bool,
 }
 
-/// What backward gives.
-pub struct NormGrads {
-    /// Gradient to `x`.
-    pub x: Vec<f32>,
-    /// Gradient to the scale, by channel.
-    pub weight: Vec<f32>,
-    /// Gradient to the shift, by channel.
-    pub bias: Vec<f32>,
+/// Where backward writes.
+pub struct NormGrads<'a> {
+    /// Holds the gradient to the result; becomes that to `x`.
+    pub x: &'a mut [f32],
+    /// Gradient to the scale, by channel, if wanted; added up.
+    pub weight: Option<&'a mut [f32]>,
+    /// Gradient to the shift, by channel, if wanted; added up.
+    pub bias: Option<&'a mut [f32]>,
 }
 
 /// Scratch by channel: the group's mean and inverse standard deviation spread over its channels, two sums, and their group means.
@@ -159,20 +159,22 @@ fn through_statistics(norm: Norm, x: &[f32], dz: &mut [f32], weight: &[f32], scr
 }
 
 per_isa! {
-    /// Gradients from `dy`, the gradient to [`in_place`]'s result; `affine` is (weight, bias).
-    pub fn backward(norm: Norm, x: &[f32], affine: (&[f32], &[f32]), dy: &[f32]) -> NormGrads {
-        let mut grads = NormGrads { x: dy.to_vec(), weight: vec![0.0; norm.channels], bias: vec![0.0; norm.channels] };
+    /// Gradients of [`in_place`]; `affine` is (weight, bias).
+    pub fn backward(norm: Norm, x: &[f32], affine: (&[f32], &[f32]), grads: NormGrads) {
+        let NormGrads { x: dz, weight: mut d_weight, bias: mut d_bias } = grads;
         let mut scratch = Scratch::new(norm.channels);
         let size = norm.steps * norm.channels;
-        for (x, dz) in x.chunks_exact(size).zip(grads.x.chunks_exact_mut(size)) {
+        for (x, dz) in x.chunks_exact(size).zip(dz.chunks_exact_mut(size)) {
             statistics(norm, x, &mut scratch);
             if norm.mish {
                 through_mish(x, dz, &scratch, affine.0, affine.1);
             }
             through_statistics(norm, x, dz, affine.0, &mut scratch);
-            grads.bias.iter_mut().zip(scratch.first.iter()).for_each(|(total, sum)| *total += sum);
-            grads.weight.iter_mut().zip(scratch.second.iter()).for_each(|(total, sum)| *total += sum);
+            for (total, sums) in [(&mut d_bias, &scratch.first), (&mut d_weight, &scratch.second)] {
+                if let Some(total) = total {
+                    total.iter_mut().zip(sums.iter()).for_each(|(total, sum)| *total += sum);
+                }
+            }
         }
-        grads
     }
 }

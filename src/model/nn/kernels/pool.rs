@@ -35,6 +35,13 @@ impl Pooled {
         zeros
     }
 
+    /// A buffer of these numbers.
+    pub fn copy_of(values: &[f32]) -> Self {
+        let mut copy = Self::take(values.len());
+        copy.copy_from_slice(values);
+        copy
+    }
+
     /// The lanes that hold it.
     pub(super) fn lanes(&self) -> &[Lane] {
         &self.lanes[..self.len.div_ceil(LANE)]
@@ -66,9 +73,7 @@ impl DerefMut for Pooled {
 
 impl Clone for Pooled {
     fn clone(&self) -> Self {
-        let mut copy = Self::take(self.len);
-        copy.copy_from_slice(self);
-        copy
+        Self::copy_of(self)
     }
 }
 
