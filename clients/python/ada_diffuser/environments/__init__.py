@@ -16,6 +16,7 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
+from .pendulum import PendulumGravityE
 from .point_wind import PointWindS
 from .search import ArsSettings, Search
 from .task import NAMES, HiddenTask
@@ -27,6 +28,7 @@ __all__ = [
     "CheetahWindE",
     "CheetahWindS",
     "HiddenTask",
+    "PendulumGravityE",
     "PointWindS",
     "Search",
     "action_noise",
