@@ -11,10 +11,11 @@ import h5py
 import numpy as np
 import pytest
 
+from ada_diffuser import environments
 from ada_diffuser.collect import Job, collect
 from ada_diffuser.commands.collect import main
 from ada_diffuser.dataset import card_path, load_episodes
-from ada_diffuser.experts import AnalyticPilot
+from ada_diffuser.experts import formula_of
 
 TINY = ["--episodes", "3", "--quiet", "--expert-searches", "1", "--expert-iterations", "1"]
 
@@ -51,7 +52,7 @@ def test_layout_is_d4rls(tmp_path):
 def test_rows_hold_the_step_as_it_was_executed():
     """Row t: the state before the step, the clipped noisy action, its reward, the wind that blew in it."""
     job = Job("point-wind-s", {"sigma": 0.0}, 2, (0.5,), seed=1)
-    episodes, failures = collect(job, AnalyticPilot())
+    episodes, failures = collect(job, formula_of(environments.PointWindS()))
     for start in (0, 200):
         rows = slice(start, start + 199)
         velocity = episodes.observations[rows, 2:]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ada_diffuser import environments
-from ada_diffuser.experts import AnalyticPilot, ExpertRecipe, load_expert, make_expert, recipe_for, save_expert
+from ada_diffuser.experts import ExpertRecipe, formula_of, load_expert, make_expert, recipe_for, save_expert
 from ada_diffuser.experts.ars import ArsSettings, RunningMoments, ascent, search
 from ada_diffuser.experts.policy import LinearPolicy, PolicyBank
 
@@ -26,7 +26,7 @@ def point_wind_return(act, episodes=64):
 
 
 def test_the_pilot_that_sees_the_wind_earns_16_and_the_blind_one_135():
-    pilot = AnalyticPilot()
+    pilot = formula_of(environments.PointWindS())
     assert point_wind_return(pilot.act) == pytest.approx(-16.2, abs=3)
     assert point_wind_return(lambda o, c: pilot.act(o, np.zeros(2))) == pytest.approx(-134.6, abs=15)
 

@@ -42,7 +42,6 @@ def collect(job: Job, expert: Expert, progress: Callable[[int], object] = lambda
     `progress` is called with the number of episodes just flown.
     """
     env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
-    _check_fit(env, expert)
     env_seed, noise_seed = np.random.SeedSequence(job.seed).generate_state(2)
     rng = np.random.default_rng(noise_seed)
     flown, failures = [], 0
@@ -76,6 +75,7 @@ def _context(env: gym.Env) -> np.ndarray | None:
 def _fly(env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, seed: int | None) -> Episodes:
     """One episode with action noise `std`."""
     observation, _ = env.reset(seed=seed)
+    _check_fit(env, expert)  # not before: what a class draws in `reset` need not be there earlier
     low, high = env.action_space.low, env.action_space.high
     steps: list[tuple[Any, ...]] = []
     ended = False
@@ -92,11 +92,6 @@ def _fly(env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, see
     arrays = [np.array(column, dtype) for column, dtype in zip(columns, dtypes, strict=True)]
     told = None if contexts[0] is None else np.array(contexts, np.float32).reshape(len(contexts), -1)
     return Episodes(*arrays, context=told)
-
-
-def default_noise(env: gym.Env) -> tuple[float, ...]:
-    """Action noise that shows states off the expert's path, as the environment names it; else none."""
-    return getattr(env.unwrapped, "action_noise", (0.0,))
 
 
 def data_card(job: Job, expert: Expert, episodes: Episodes, failures: int) -> dict[str, Any]:

@@ -12,9 +12,7 @@ from types import ModuleType
 from ada_diffuser.errors import AdaError
 
 DEFAULT_URL = "127.0.0.1:7777"
-
-
-_ENV_HELP = "short name (point-wind-s, cheetah-wind-s, cheetah-wind-e, cheetah-vel-e), Gymnasium id, or MODULE:ID to import it from"
+_ENV_HELP = "short name, as point-wind-s (a wrong one lists them all), Gymnasium id, or MODULE:ID to import it from"
 
 
 def add_environment_arguments(parser: argparse.ArgumentParser) -> None:

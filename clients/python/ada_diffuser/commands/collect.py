@@ -7,6 +7,7 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +22,15 @@ if TYPE_CHECKING:
 _ABOUT = """\
 Let an expert that sees the hidden context fly an environment, and write the episodes as a D4RL-layout HDF5 file:
 observations, actions (as executed), rewards, terminals, timeouts, infos/context, infos/action_noise; one row a step.
-Beside it goes X.card.json: environment, options, seed, returns, expert, SHA-256, the command. An environment of somebody
-else's (--env MODULE:ID) needs --expert: a function of yours that takes the observation and the context, which is None unless
-the environment has an attribute `context`, or random actions. infos/context is written where `info["context"]` tells it.
+Beside it goes X.card.json: environment, options, seed, returns, expert, SHA-256, the command. infos/context is written where
+`info["context"]` tells it.
 
-The expert of PointWind is a formula. The cheetah's are trained here by Augmented Random Search (linear policies,
-one to two minutes for each search, two at a time) and kept beside the data as X.expert.npz; a later call with the same
-environment, options, and expert settings uses that file again. The same arguments give the same bytes."""
+An environment's class says what its expert is. A formula (its method `expert_action`) flies at once. Where there is none, policies
+are searched for here (Augmented Random Search, linear policies; for the cheetah one to two minutes for each search, two at a
+time) and kept beside the data as X.expert.npz; a later call with the same environment, options, and expert settings uses that
+file again. An environment that says nothing of it needs --expert: a function of yours that takes the observation and the
+context, which is None unless the environment has an attribute `context`, or random actions. The same arguments give the same
+bytes."""
 
 _EXAMPLES = """\
 examples:
@@ -78,13 +81,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--action-noise",
         metavar="A,B,..",
-        help="standard deviations; each episode draws one (point 0.1,0.2,0.3; cheetah 0,0.05,0.1; others 0)",
+        help="standard deviations; each episode draws one (default: as the environment's class says, else 0)",
     )
     expert = parser.add_argument_group("expert")
     expert.add_argument("--expert", metavar="E", help="fly this one: X.npz, MODULE:FUNCTION (of observation and context), or random")
     expert.add_argument("--expert-seed", type=int, default=0, metavar="N", help="of the searches (default 0)")
-    expert.add_argument("--expert-searches", type=int, default=3, metavar="N", help="searches for each policy (default 3)")
-    expert.add_argument("--expert-iterations", type=int, default=300, metavar="N", help="updates in a search (default 300)")
+    expert.add_argument(
+        "--expert-searches", type=int, metavar="N", help="searches for each policy (default: as the environment's class says, 3)"
+    )
+    expert.add_argument(
+        "--expert-iterations", type=int, metavar="N", help="updates in a search (default: as the environment's class says, 300)"
+    )
     parser.add_argument("--json", action="store_true", help="print the data card instead of a summary")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     return parser
@@ -92,7 +99,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _check_arguments(args: argparse.Namespace) -> None:
     for flag, least in (("episodes", 1), ("seed", 0), ("expert_seed", 0), ("expert_searches", 1), ("expert_iterations", 1)):
-        if getattr(args, flag) < least:
+        value = getattr(args, flag)
+        if value is not None and value < least:
             raise ValueError(f"--{flag.replace('_', '-')} must be at least {least}")
     check_output("--out", args.out, ".h5", ".hdf5")
 
@@ -100,15 +108,15 @@ def _check_arguments(args: argparse.Namespace) -> None:
 def _plan(args: argparse.Namespace) -> tuple[Job, ExpertRecipe | None]:
     """What to fly and, where the expert is to be searched for, how. Raises `ValueError` naming the argument that is wrong."""
     environments = import_environments()
-    from ada_diffuser.collect import Job, default_noise
+    from ada_diffuser.collect import Job
     from ada_diffuser.experts import recipe_for
-    from ada_diffuser.experts.ars import ArsSettings
 
     options = {name: _value(text) for name, text in parse_settings(args.option).items()}
     env = environments.make(args.env, episode_steps=args.episode_steps, **options)
-    noise = _noise(args.action_noise) if args.action_noise else default_noise(env)
-    ars = ArsSettings(iterations=args.expert_iterations)
-    recipe = None if args.expert else recipe_for(env, options, args.expert_seed, args.expert_searches, ars)
+    noise = _noise(args.action_noise) if args.action_noise else environments.action_noise(env)
+    recipe = None if args.expert else recipe_for(env, options, args.expert_seed, args.expert_searches)
+    if recipe and args.expert_iterations:
+        recipe = replace(recipe, ars=replace(recipe.ars, iterations=args.expert_iterations))
     env_id = args.env if ":" in args.env else env.spec.id
     return Job(env_id, options, args.episodes, noise, args.seed, args.episode_steps), recipe
 
@@ -134,15 +142,16 @@ def _noise(text: str) -> tuple[float, ...]:
 def _expert(args: argparse.Namespace, job: Job, recipe: ExpertRecipe | None) -> Expert:
     """The one given, the formula, the file beside the output if its recipe is this one, or a new search."""
     from ada_diffuser import environments
-    from ada_diffuser.experts import AnalyticPilot, import_expert, load_expert, make_expert, random_expert, save_expert
+    from ada_diffuser.experts import formula_of, import_expert, load_expert, make_expert, random_expert, save_expert
 
+    env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
     if args.expert == "random":
-        bounds = environments.make(job.env, episode_steps=job.episode_steps, **job.options).action_space
-        return random_expert(bounds.low, bounds.high, job.seed)
+        return random_expert(env.action_space.low, env.action_space.high, job.seed)
     if args.expert:
         return import_expert(args.expert) if _is_function(args.expert) else load_expert(Path(args.expert))
-    if recipe is None:
-        return AnalyticPilot()
+    if formula := formula_of(env):
+        return formula
+    assert recipe
     cache = args.out.with_name(f"{args.out.stem}.expert.npz")
     if cache.exists():
         expert = load_expert(cache)

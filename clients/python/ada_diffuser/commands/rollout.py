@@ -30,8 +30,7 @@ _ABOUT = """\
 Drives an environment with a model on a running ada-server and prints what it earned and what it cost.
 Folders of --json, --plot and --film are made before the first episode, and one that fails does not keep back the others.
 Episode e runs with seed SEED + e, in the environment and in the model, so the same command gives the same returns and all
-models see the same episodes. Failed is what the environment says failed: point-wind-s below -60 (a pilot that knows only the
-mean wind: -47), the cheetahs below three quarters of what standing still earns (wind tasks -225)."""
+models see the same episodes. Failed is what the environment's class calls failed (clients/python/README.md lists it)."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -16,10 +16,26 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
+from .pendulum import PendulumGravityE
 from .point_wind import PointWindS
+from .search import ArsSettings, Search
 from .task import NAMES, HiddenTask
 
-__all__ = ["NAMES", "CheetahVelE", "CheetahWindE", "CheetahWindS", "HiddenTask", "PointWindS", "failed", "make", "steps_max"]
+__all__ = [
+    "NAMES",
+    "ArsSettings",
+    "CheetahVelE",
+    "CheetahWindE",
+    "CheetahWindS",
+    "HiddenTask",
+    "PendulumGravityE",
+    "PointWindS",
+    "Search",
+    "action_noise",
+    "failed",
+    "make",
+    "steps_max",
+]
 
 
 def make(name: str, *, episode_steps: int | None = None, **options: Any) -> gym.Env:
@@ -59,6 +75,11 @@ def failed(env: gym.Env, episode_return: float) -> bool:
     """Whether the environment calls a finished episode failed; one that has no opinion never does."""
     opinion = getattr(env.unwrapped, "failed", None)
     return bool(callable(opinion) and opinion(episode_return))
+
+
+def action_noise(env: gym.Env) -> tuple[float, ...]:
+    """Standard deviations of the noise that the environment wants in its data; none where it says nothing."""
+    return getattr(env.unwrapped, "action_noise", (0.0,))
 
 
 def _import(module: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from .half_cheetah import ACTION_SIZE, OBSERVATION_SIZE, HalfCheetahBody
+from .search import Search
 from .task import HiddenTask
 
 ACTION_COST = 0.05
@@ -28,6 +29,7 @@ class CheetahTask(HiddenTask):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own spelling)
+    action_noise = (0.0, 0.05, 0.1)  # more of it stops the gait
 
     def __init__(self, wind_on: str = "torso", render_mode: str | None = None) -> None:
         if render_mode not in (None, "rgb_array"):
@@ -103,6 +105,7 @@ class CheetahTask(HiddenTask):
 class _CheetahWind(CheetahTask):
     """A head wind of `gain * (mean + swing sin(rate * clock + phi))` N; the context is that force."""
 
+    search = Search(varies={"gain": 0.2})  # a gait that knows one strength alone is fragile
     mean: float
     swing: float
     rate: float
@@ -180,6 +183,8 @@ class CheetahVelE(CheetahTask, name="cheetah-vel-e", id="ada/CheetahVel-E-v0"):
         render_mode: `rgb_array` or None.
     """
 
+    search = Search(holds="targets")
+
     def __init__(self, targets: str | Sequence[float] = (1.0, 2.5), render_mode: str | None = None) -> None:
         super().__init__(render_mode=render_mode)
         if isinstance(targets, str):
@@ -192,7 +197,7 @@ class CheetahVelE(CheetahTask, name="cheetah-vel-e", id="ada/CheetahVel-E-v0"):
 
     @property
     def search_targets(self) -> tuple[float, ...]:
-        """One expert a speed."""
+        """One policy a speed."""
         return GRID_SPEEDS if isinstance(self.targets, str) else tuple(sorted(set(self.targets)))
 
     def _draw_context(self, starts_session: bool) -> None:

@@ -42,7 +42,6 @@ class PointWindS(HiddenTask, name="point-wind-s", id="ada/PointWind-S-v0"):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own spelling)
     action_noise = (0.1, 0.2, 0.3)
-    search_targets = None
 
     def __init__(
         self,
@@ -95,6 +94,10 @@ class PointWindS(HiddenTask, name="point-wind-s", id="ada/PointWind-S-v0"):
         self._trail = [*self._trail[1 - TRAIL_STEPS :], self._position]
         reward = -float(np.linalg.norm(self._position)) - ACTION_COST * float(action @ action)
         return self._observation(), reward, False, False, {"context": wind}
+
+    def expert_action(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
+        """clip((-3 p - 2.5 v - w_t u) / 4)"""
+        return (-3.0 * observation[:2] - 2.5 * observation[2:] - context) / 4.0
 
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode did worse than a pilot that ignores how the wind changes."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+
+from .search import Search
 
 NAMES: dict[str, str] = {}
 """Short name for command lines -> Gymnasium id."""
@@ -15,15 +18,25 @@ class HiddenTask(gym.Env[np.ndarray, np.ndarray]):
     """An environment whose dynamics or goal depend on a context that the observation does not show.
 
     `class Mine(HiddenTask, name="mine", id="ada/Mine-v0")` is all that a new one needs to be known to Gymnasium and to the
-    commands; `name` and `id` are left out where a class is only there to be inherited from.
+    commands; `name` and `id` are left out where a class is only there to be inherited from. Nothing else knows an environment:
+    its expert, noise, failures and length are asked of the class, and a film is drawn where it has Gymnasium's `render` and
+    says `rgb_array` in its `metadata`. docs/simulator.md writes one.
     """
 
     episode_steps: ClassVar[int] = 200
     """Steps after which an episode is truncated."""
 
     action_noise: ClassVar[tuple[float, ...]] = (0.0, 0.05, 0.1)
-    """Standard deviations of the action noise under which `ada-collect` flies, where it is told no other; more of it stops the
-    cheetah's gait."""
+    """Standard deviations of the action noise, in units of the action, under which `ada-collect` flies where it is told no other:
+    data should show states off the expert's path, and the way back."""
+
+    expert_action: ClassVar[Callable[..., np.ndarray] | None] = None
+    """The expert, where it is a formula: a method `expert_action(self, observation, context)` that answers an action, clipped or
+    not. It may use the environment's options, but nothing of the running episode. Its docstring's first line is the law on the
+    data card."""
+
+    search: ClassVar[Search | None] = Search()
+    """How the expert is searched for, where there is no formula."""
 
     def __init_subclass__(cls, *, name: str = "", id: str = "", **rest: Any) -> None:
         super().__init_subclass__(**rest)
@@ -37,10 +50,10 @@ class HiddenTask(gym.Env[np.ndarray, np.ndarray]):
         raise NotImplementedError
 
     @property
-    def search_targets(self) -> tuple[float, ...] | None:
-        """Contexts that get an expert of their own in a search; empty: one expert reads the context; None: it is a formula."""
+    def search_targets(self) -> tuple[float, ...]:
+        """Contexts that get a policy of their own in a search, with `Search.holds`; empty: one policy reads the context."""
         return ()
 
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode counts as failed."""
-        raise NotImplementedError
+        return False

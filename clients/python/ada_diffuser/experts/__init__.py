@@ -1,7 +1,6 @@
-"""Experts that see the hidden context, made on the spot: analytic for the point mass, ARS for the cheetah."""
+"""Experts that see the hidden context, made on the spot: the environment's own formula, or a search as it wants one."""
 
 from .policy import (
-    AnalyticPilot,
     CalledExpert,
     Expert,
     LinearPolicy,
@@ -11,15 +10,15 @@ from .policy import (
     random_expert,
     save_expert,
 )
-from .training import ExpertRecipe, make_expert, recipe_for
+from .training import ExpertRecipe, formula_of, make_expert, recipe_for
 
 __all__ = [
-    "AnalyticPilot",
     "CalledExpert",
     "Expert",
     "ExpertRecipe",
     "LinearPolicy",
     "PolicyBank",
+    "formula_of",
     "import_expert",
     "load_expert",
     "make_expert",

@@ -3,32 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
+from ..environments.search import ArsSettings
 from .policy import LinearPolicy
 
 STD_MIN = 1e-3
-
-
-@dataclass(frozen=True)
-class ArsSettings:
-    """The constants of the search.
-
-    Attributes:
-        iterations: updates of the policy; each costs `2 * directions` episodes.
-        directions: perturbations tried in an iteration, N in the paper.
-        top: of these, how many best ones the update uses, b.
-        step: step size, alpha.
-        noise: standard deviation of a perturbation, nu.
-    """
-
-    iterations: int = 300
-    directions: int = 8
-    top: int = 4
-    step: float = 0.02
-    noise: float = 0.03
 
 
 class RunningMoments:

@@ -7,7 +7,7 @@ import json
 import os
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,23 +29,8 @@ class Expert(Protocol):
 
 
 @dataclass
-class AnalyticPilot:
-    """PointWind-S: proportional-derivative control that cancels the wind, `(-3 p - 2.5 v - w) / 4`."""
-
-    card: dict[str, Any] = field(default_factory=lambda: {"kind": "analytic", "law": "clip((-3 p - 2.5 v - w_t u) / 4)"})
-
-    def sizes(self, context_size: int) -> tuple[int, int]:
-        """See `Expert.sizes`."""
-        return 4, 2
-
-    def act(self, observation: np.ndarray, context: np.ndarray) -> np.ndarray:
-        """See `Expert.act`; observation (4,), context (2,), action (2,)."""
-        return (-3.0 * observation[:2] - 2.5 * observation[2:] - context) / 4.0
-
-
-@dataclass
 class CalledExpert:
-    """Somebody's own function of the observation and the context.
+    """A function of the observation and the context: an environment's own formula, or somebody's.
 
     Attributes:
         function: called as `function(observation, context)`; the context is None where the environment tells none.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import multiprocessing
 import signal
 from collections.abc import Callable
@@ -13,12 +14,12 @@ import gymnasium as gym
 import numpy as np
 
 from .. import environments
-from .ars import ArsSettings, search
-from .policy import AnalyticPilot, Expert, LinearPolicy, PolicyBank
+from ..environments import ArsSettings, Search
+from .ars import search
+from .policy import CalledExpert, LinearPolicy, PolicyBank
 
 PROCESSES_MAX = 2
 POLL_S = 0.5
-GAIN_SPREAD = 0.2
 JUDGE_EVERY = 5
 JUDGE_EPISODES = 9
 FRESH_EPISODES = 48
@@ -33,7 +34,7 @@ class ExpertRecipe:
         options: keyword arguments of the environment.
         seed: of all searches.
         seeds: independent searches for each policy.
-        targets: wanted speeds that get a policy each; empty where one policy reads the context.
+        targets: contexts that get a policy each; empty where one policy reads the context.
         judge_noise: standard deviations of the action noise the iterates are judged under, as the data will have.
         ars: constants of the search.
     """
@@ -56,30 +57,42 @@ class ExpertRecipe:
         return {**asdict(self), "targets": list(self.targets), "judge_noise": list(self.judge_noise)}
 
 
-def recipe_for(env: gym.Env, options: dict[str, Any], seed: int, seeds: int, ars: ArsSettings) -> ExpertRecipe | None:
-    """The recipe of an environment's expert, or None where the expert is a formula.
+def formula_of(env: gym.Env) -> CalledExpert | None:
+    """The expert that the environment's class has as a method, with the options of `env`; None where there is none."""
+    act = getattr(env.unwrapped, "expert_action", None)
+    if not callable(act):
+        return None
+    law = inspect.cleandoc(act.__doc__ or "").partition("\n")[0]
+    return CalledExpert(act, {"kind": "analytic", "law": law})
 
-    Raises `ValueError` for an environment that has neither.
+
+def recipe_for(
+    env: gym.Env, options: dict[str, Any], seed: int, seeds: int | None = None, ars: ArsSettings | None = None
+) -> ExpertRecipe | None:
+    """The recipe of an environment's expert as its class wants it searched for, or None where the expert is a formula.
+
+    `seeds` and `ars` take the place of the class's own. Raises `ValueError` for an environment that has neither.
     """
+    if formula_of(env):
+        return None
     task = env.unwrapped
     env_id, module = env.spec.id, type(task).__module__
-    if not isinstance(task, environments.HiddenTask):
+    how, targets = getattr(task, "search", None), getattr(task, "search_targets", ())
+    if not isinstance(how, Search):
         raise ValueError(f"{env_id} has no expert of its own; give one: --expert MODULE:FUNCTION, --expert FILE.npz, or --expert random")
-    if task.search_targets is None:
-        return None
+    if targets and not how.holds:
+        raise ValueError(f"{env_id} has search_targets, but its search does not say which option holds one of them")
     if not module.startswith(environments.__name__):
         env_id = f"{module}:{env_id}"  # the processes that search must import it, too
-    return ExpertRecipe(env_id, options, seed, seeds, task.search_targets, ars=ars)
+    return ExpertRecipe(env_id, options, seed, seeds or how.searches, targets, environments.action_noise(env), ars or how.ars)
 
 
-def make_expert(recipe: ExpertRecipe | None, progress: Callable[[int], object] = lambda iterations: None) -> Expert:
-    """Run the searches of a recipe, two at a time; without a recipe, the analytic pilot.
+def make_expert(recipe: ExpertRecipe, progress: Callable[[int], object] = lambda iterations: None) -> PolicyBank:
+    """Run the searches of a recipe, two at a time.
 
     `progress` is called now and then with the number of iterations just made, `recipe.iterations` in all. The result does not
     depend on the number of processes.
     """
-    if recipe is None:
-        return AnalyticPilot()
     found = _run_searches(recipe, progress)
     slots = [found[i : i + recipe.seeds] for i in range(0, len(found), recipe.seeds)]
     best = [max(slot, key=lambda result: result[1]["fresh"]["mean"]) for slot in slots]
@@ -127,23 +140,28 @@ class _Course:
     """The bare environment of one policy, held at one target where the policy is trained for one."""
 
     def __init__(self, recipe: ExpertRecipe, slot: int) -> None:
-        held = {"targets": (recipe.targets[slot],)} if recipe.targets else {}
-        self.env = environments.make(recipe.env, **{**recipe.options, **held}).unwrapped
-        self.gain = getattr(self.env, "gain", None)
+        env = environments.make(recipe.env, **recipe.options)
+        how = env.unwrapped.search
+        if recipe.targets:
+            env = environments.make(recipe.env, **{**recipe.options, how.holds: (recipe.targets[slot],)})
+        self.env, self.steps = env.unwrapped, environments.steps_max(env)
+        self.varied = {name: (getattr(self.env, name), share) for name, share in how.varies.items()}
         self.sees_context = not recipe.targets
+        self.env.reset(seed=0)  # what a class draws there need not be there earlier
         context_size = len(self.env.context) if self.sees_context else 0
         self.shape = (self.env.action_space.shape[0], self.env.observation_space.shape[0] + context_size)
 
     def practise(self, policy: LinearPolicy, seed: int) -> tuple[float, np.ndarray]:
-        """An episode to learn from; the wind's gain varies, since a gait that knows one strength alone is fragile."""
-        if self.gain is not None:
-            self.env.gain = self.gain * np.random.default_rng([seed, 2]).uniform(1.0 - GAIN_SPREAD, 1.0 + GAIN_SPREAD)
+        """An episode to learn from, with the options varied as the environment wants it."""
+        rng = np.random.default_rng([seed, 2])
+        for name, (value, share) in self.varied.items():
+            setattr(self.env, name, value * rng.uniform(1.0 - share, 1.0 + share))
         return self._play(policy, seed, 0.0)
 
     def judge(self, policy: LinearPolicy, seeds: np.ndarray, noises: tuple[float, ...]) -> np.ndarray:
         """Returns (episodes,) in the environment as it is, under each action noise in turn."""
-        if self.gain is not None:
-            self.env.gain = self.gain
+        for name, (value, _) in self.varied.items():
+            setattr(self.env, name, value)
         return np.array([self._play(policy, int(seed), noises[i % len(noises)])[0] for i, seed in enumerate(seeds)])
 
     def summary(self, returns: np.ndarray) -> dict[str, Any]:
@@ -152,7 +170,7 @@ class _Course:
             "episodes": len(returns),
             "mean": round(float(returns.mean()), 3),
             "median": round(float(np.median(returns)), 3),
-            "failures": int(sum(self.env.failed(r) for r in returns)),
+            "failures": int(sum(environments.failed(self.env, r) for r in returns)),
         }
 
     def _play(self, policy: LinearPolicy, seed: int, noise: float) -> tuple[float, np.ndarray]:
@@ -160,7 +178,7 @@ class _Course:
         rng = np.random.default_rng([seed, 1])
         observation, _ = self.env.reset(seed=seed)
         visited, total = [], 0.0
-        for _ in range(self.env.episode_steps):
+        for _ in range(self.steps):
             features = np.concatenate([observation, self.env.context]) if self.sees_context else observation
             action = policy.act(features)
             if noise:
