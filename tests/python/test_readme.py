@@ -3,10 +3,12 @@
 All fenced blocks are found and run, so a new one is tested without a word here. A comment before a block says what is different:
 
     <!-- given: env, state -->      it uses things of the reader's own; GIVEN makes them
+    <!-- file: lift.py -->          the reader writes it to this file, which later blocks use
     <!-- run by .ci/run -->         another file runs it (and names it: the commands, or this document)
     <!-- dry run: reason -->        its commands, files and make targets must be there, but it is not run
 
-What would take hours is shortened by SHORT_FLAGS and SHORT_RECIPES and nowhere else; `7777` becomes a free port.
+What would take hours is shortened by SHORT_FLAGS and SHORT_RECIPES and nowhere else, and not in a document IN_FULL; `7777` becomes a
+free port.
 """
 
 from __future__ import annotations
@@ -32,10 +34,15 @@ from server import BINARY, ROOT
 
 SHORT_FLAGS = {
     "ada-collect": "--episodes 4 --expert-searches 1 --expert-iterations 1",
-    "ada-rollout": "--episodes 2 --episode-steps 12 --url 127.0.0.1:7777",
-    "ada-evaluate": "--episodes 2 --episode-steps 12 --url 127.0.0.1:7777",
+    "ada-rollout": "--episodes 2 --episode-steps 12",
+    "ada-evaluate": "--episodes 2 --episode-steps 12",
 }
 """Added to every call of a command; the last word on a flag counts."""
+
+PORT_FLAGS = {"ada-rollout": "--url 127.0.0.1:7777", "ada-evaluate": "--url 127.0.0.1:7777"}
+
+IN_FULL = ("docs/simulator.md",)
+"""Documents whose commands are small enough to be run to their end, so that what they promise comes out."""
 
 SHORT_RECIPES = [(r"^steps = \d+", "steps = 2"), (r"^(filter|successor_state) = \S+", r"\1 = 1000.0")]
 """Replaced in every recipe: two steps of training, and a gate that lets them pass."""
@@ -52,7 +59,16 @@ GIVEN = {
     "states": "states = [[0.1, 0.2, 0.0, 0.0]] * 3",
 }
 
-SAYS = {"README.md": ['"actions":', '"latent_mean":', '"evaluations":8', '"step":2', '"cheetah-wind-s"']}
+SAYS = {
+    "README.md": ['"actions":', '"latent_mean":', '"evaluations":8', '"step":2', '"cheetah-wind-s"'],
+    "docs/simulator.md": [
+        "data/lift.h5: 100 episodes, 10000 steps; return -9.67 +- 0.36, median -9.03, 0 failed",
+        "stage2 step 600 of 600",
+        "lift-seed0@",
+        "failures            0 of 64",
+        "film: out/lift.gif",
+    ],
+}
 """Words that the answers of a document's examples must hold."""
 
 DOCUMENTS = subprocess.run(
@@ -65,14 +81,14 @@ class Example:
     document: str
     language: str
     text: str
-    #: The comment before it: `given`, `run by`, `dry run`, or nothing; and its words.
+    #: The comment before it: `given`, `file`, `run by`, `dry run`, or nothing; and its words.
     mark: str
     words: str
 
 
 def examples(document: str) -> list[Example]:
     text = (ROOT / document).read_text(encoding="utf-8")
-    fence = r"(?:<!-- (given|run by|dry run):? ?(.*?) -->\n)?^( *)```(.*)\n((?s:.*?))^ *```$"
+    fence = r"(?:<!-- (given|file|run by|dry run):? ?(.*?) -->\n)?^( *)```(.*)\n((?s:.*?))^ *```$"
     found = re.findall(fence, text, re.MULTILINE)
     return [
         Example(document, language, re.sub(rf"^{indent}", "", body, flags=re.MULTILINE), mark, words)
@@ -83,7 +99,7 @@ def examples(document: str) -> list[Example]:
 class Checkout:
     """A clone with everything built: what is tracked and what was built, the commands shortened, and none of a run's outputs."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, shortened: bool) -> None:
         self.folder = folder
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = str(free.getsockname()[1])
@@ -91,7 +107,7 @@ class Checkout:
             if path.name not in ("target", "models", "data", "runs", "out", "shipped") and not path.name.startswith("."):
                 (folder / path.name).symlink_to(path)
         self._models()
-        self._commands()
+        self._commands(shortened)
         self.path = f"{folder / '.venv/bin'}:{folder / 'target/release'}:{os.environ['PATH']}"
 
     def _models(self) -> None:
@@ -102,13 +118,14 @@ class Checkout:
                 text = re.sub(pattern, short, text, flags=re.MULTILINE)
             recipe.write_text(text, encoding="utf-8")
 
-    def _commands(self) -> None:
+    def _commands(self, shortened: bool) -> None:
         scripts, built = self.folder / ".venv/bin", self.folder / "target/release"
         scripts.mkdir(parents=True)
         built.mkdir(parents=True)
         for name, flags in SHORT_FLAGS.items():
             module = f"ada_diffuser.commands.{name.removeprefix('ada-')}"
-            self._script(scripts / name, f'exec {sys.executable} -m {module} "$@" {flags}')
+            added = f"{flags if shortened else ''} {PORT_FLAGS.get(name, '')}"
+            self._script(scripts / name, f'exec {sys.executable} -m {module} "$@" {added}')
         self._script(scripts / "cargo", "exit 0")
         (scripts.parent / ".ready").touch()
         (built / "ada-trainer").symlink_to(BINARY.with_name("ada-trainer"))
@@ -143,8 +160,8 @@ class Checkout:
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> Iterator[Checkout]:
-    checkout = Checkout(tmp_path)
+def checkout(tmp_path: Path, document: str) -> Iterator[Checkout]:
+    checkout = Checkout(tmp_path, shortened=document not in IN_FULL)
     yield checkout
     checkout.stop_server()
 
@@ -153,6 +170,10 @@ def run(example: Example, checkout: Checkout) -> str:
     """What the example printed."""
     assert example.mark != "given" or example.language == "python"
     match example.mark, example.language:
+        case "file", _:
+            path = checkout.folder / example.words
+            assert not path.exists(), f"{path.name} is there already"
+            path.write_text(example.text, encoding="utf-8")
         case "run by", _:
             runner = (ROOT / example.words).read_text(encoding="utf-8")
             commands = [line.split("#")[0].strip() for line in example.text.splitlines()]
