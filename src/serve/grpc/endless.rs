@@ -47,7 +47,9 @@ impl HttpBody for UntilLeave {
             return Poll::Ready(None);
         }
         let frame = Pin::new(&mut self.body).poll_frame(context);
-        if frame.is_pending() && self.leave.as_mut().poll(context).is_ready() {
+        // A stream may end by itself in the same moment, since what it watches ends too: the farewell is the same then.
+        let says_more = matches!(&frame, Poll::Ready(Some(Ok(frame))) if frame.is_data());
+        if !says_more && self.leave.as_mut().poll(context).is_ready() {
             self.ended = true;
             // What it holds (a task of reflection waits for the next question) is let go.
             self.body = Body::empty();

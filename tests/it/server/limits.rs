@@ -7,7 +7,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 async fn answer_of(stream: &mut TcpStream) -> String {
     let mut text = Vec::new();
     let _reset_counts_as_end =
-        timeout(Duration::from_secs(5), stream.read_to_end(&mut text)).await.expect("the server keeps the connection");
+        timeout(Duration::from_secs(30), stream.read_to_end(&mut text)).await.expect("the server keeps the connection");
     String::from_utf8_lossy(&text).into_owned()
 }
 
