@@ -46,9 +46,9 @@
 //! | paper | code | paper | code |
 //! |---|---|---|---|
 //! | K | `level_max` | T_o | `obs_horizon` |
-//! | k_i | `level`, `levels` | T_p | `plan_horizon` |
+//! | k_i | `level`, `levels` | T_p | `horizon` (on the wire `plan_horizon`) |
 //! | abar_k | `alpha_bar` | T_a | `action_horizon` |
-//! | eps_theta | [`model::denoiser::Denoiser::predict`] (it predicts x0) | T_x | `block_len` |
+//! | eps_theta | [`model::denoiser::Denoiser::predict`] (it predicts x0) | T_x | `block_len`, [`model::method::Looks`] |
 //! | c_t | `latent`, `latents` | x_t | [`model::trajectory::Token`], columns by [`model::columns::Columns`] |
 //! | p_phi, q_psi, p(x given x, c) | [`model::latent::Prior`], [`model::latent::Encoder`], [`model::latent::Decoder`] | zig-zag | `kappa` |
 #![warn(missing_docs)]

@@ -79,10 +79,14 @@ impl ModelConfig {
         size("layout.state_dim", self.layout.state_dim, COLUMNS_MAX)?;
         size("layout.action_dim", self.layout.action_dim, COLUMNS_MAX)?;
         let Method { latent, plan } = &self.method;
-        let Diffusion { horizon, obs_horizon, level_max, schedule: _, backbone: _, clip } = plan;
+        let Diffusion { horizon, obs_horizon, level_max, schedule, backbone: _, clip } = plan;
         size("method.plan.horizon", *horizon, HORIZON_MAX)?;
         size("method.plan.obs_horizon", *obs_horizon, HISTORY_MAX)?;
         size("method.plan.level_max", *level_max, LEVEL_MAX_MAX)?;
+        match schedule {
+            Schedule::Ladder => {}
+            Schedule::Uniform { steps } => size("method.plan.schedule.steps", *steps, *level_max)?,
+        }
         if let Some(gru) = latent.gru() {
             let GruLatent { dim, hidden, looks: _, future: _ } = gru;
             size("method.latent.dim", *dim, WIDTH_MAX)?;

@@ -104,7 +104,7 @@ pub struct Stage1 {
     pub steps: usize,
     /// Blocks in a batch.
     pub batch: usize,
-    /// Steps of a block beyond its first `block_len + 1` tokens.
+    /// Steps of a block beyond its first `block_len + 1` tokens; that of a GRU which runs on begins at an episode's start.
     pub length: usize,
     /// Of all latent networks.
     pub learning_rate: LearningRate,

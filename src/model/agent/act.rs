@@ -81,11 +81,6 @@ impl Act {
         }
     }
 
-    /// Windows that one evaluation of the denoiser has for it: what an engine counts.
-    pub fn rows(&self) -> usize {
-        1
-    }
-
     /// Whether the chunk is ready to be taken by [`super::Agent::finish`].
     pub fn is_done(&self) -> bool {
         self.descent.is_done()

@@ -42,7 +42,7 @@ pub(super) fn blocks(
     walk: Walk,
 ) -> Result<Tokens<Buffer>> {
     let block_len = config.method.latent.block_len();
-    let ahead = &evidence.ahead()[..evidence.ahead().len().min(config.method.plan.horizon)];
+    let ahead = evidence.ahead_within(config.method.plan.horizon);
     let rows = acts.iter().filter(|act| which(act));
     Tokens::pack(config.layout, rows, block_len + ahead.len(), |act, position| match position.checked_sub(block_len) {
         None => act.past(block_len - 1 - position, walk).unwrap_or_default(),

@@ -9,13 +9,15 @@
 use super::{process::Process, schedule::Table};
 use crate::model::{
     Networks,
+    columns::Columns,
     denoiser::Given,
     latent::{Evidence, Gaussian, LatentModel, Tokens},
     method::Diffusion,
-    trajectory::Seen,
+    trajectory::{Layout, Seen},
 };
 use candle_core::{Device, Result, Tensor};
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 
 /// Where the latents of a training window come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -70,6 +72,12 @@ pub struct WindowBatch {
 }
 
 impl WindowBatch {
+    /// Columns of a position.
+    fn columns(&self) -> Result<Columns> {
+        let (state_dim, action_dim) = (self.history.state.dim(2)?, self.history.action.dim(2)?);
+        Ok(Columns::state_action(Layout { state_dim, action_dim }))
+    }
+
     /// Windows `start..start + len` alone.
     ///
     /// # Errors
@@ -202,8 +210,7 @@ fn prior_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<Tensor> {
 /// Posterior of position 0 from history and the noised tokens 0 and 1, and the prior chain from it: what a sampler at READY has.
 fn refined_latents(latent: &LatentModel, batch: &WindowBatch, noised: &Noised) -> Result<Tensor> {
     let len = batch.window.dim(1)?;
-    let ahead = &Evidence::Refinement.ahead()[..Evidence::Refinement.ahead().len().min(len)];
-    let tokens = window_tokens(batch, &noised.refined_from.x, ahead, Some(&noised.refined_from.sigma))?;
+    let tokens = window_tokens(batch, &noised.refined_from.x, Evidence::Refinement.ahead_within(len), Some(&noised.refined_from.sigma))?;
     let posterior = infer(latent, batch, tokens)?;
     let head = posterior.mean.clone();
     chain_means(latent, posterior, vec![head], len - 1)
@@ -232,17 +239,17 @@ fn teacher_forced_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<T
 /// The first positions of the windows `x` as tokens, of which this is seen.
 fn window_tokens(batch: &WindowBatch, x: &Tensor, seen: &[Seen], sigma: Option<&Tensor>) -> Result<Tokens> {
     let (rows, len) = (x.dim(0)?, seen.len());
-    let (state_dim, action_dim) = (batch.history.state.dim(2)?, batch.history.action.dim(2)?);
+    let columns = batch.columns()?;
     let flags: Vec<f32> = seen.iter().flat_map(|seen| seen.flags()).collect();
     let present = Tensor::from_vec(flags, (1, len, 3), x.device())?.broadcast_as((rows, len, 3))?.contiguous()?;
-    let part = |start, width, index| {
-        let part = x.narrow(1, 0, len)?.narrow(2, start, width)?.contiguous()?;
+    let part = |columns: &Range<usize>, index| {
+        let part = x.narrow(1, 0, len)?.narrow(2, columns.start, columns.len())?.contiguous()?;
         part.broadcast_mul(&present.narrow(2, index, 1)?)
     };
     let zeros = Tensor::zeros((rows, len, 1), x.dtype(), x.device())?;
     Ok(Tokens {
-        state: part(0, state_dim, 0)?,
-        action: part(state_dim, action_dim, 1)?,
+        state: part(&columns.state, 0)?,
+        action: part(&columns.action, 1)?,
         reward: zeros.clone(),
         noise: sigma.map_or(Ok(zeros), |sigma| sigma.narrow(1, 0, len)?.contiguous())?,
         present,
@@ -278,13 +285,13 @@ impl Noised {
 
 /// q_sample at these levels, `B * T`; the state at position 0 is the real one where it is inpainted.
 fn q_sample(batch: &WindowBatch, process: &Process, levels: &[usize]) -> Result<Seat> {
-    let ((count, len, dim), state_dim) = (batch.window.dims3()?, batch.history.state.dim(2)?);
+    let ((count, len, dim), columns) = (batch.window.dims3()?, batch.columns()?);
     let mut coefficients = [Vec::with_capacity(count * len * dim), Vec::with_capacity(count * len * dim)];
     for (index, level) in levels.iter().enumerate() {
         let (signal, noise) = process.q_sample(*level);
-        let inpainted = index % len == 0 && batch.imagined[index / len] == 0;
+        let known = columns.known(index % len, batch.imagined[index / len] == 0);
         for column in 0..dim {
-            let kept = inpainted && column < state_dim;
+            let kept = known.contains(&column);
             coefficients[0].push(if kept { 1.0 } else { signal });
             coefficients[1].push(if kept { 0.0 } else { noise });
         }
@@ -299,12 +306,12 @@ fn q_sample(batch: &WindowBatch, process: &Process, levels: &[usize]) -> Result<
 
 /// `(B, T, D)`: 1 for each entry, more for the first action, 0 for what is inpainted; each window's weights sum to 1.
 fn loss_weights(batch: &WindowBatch, options: &RefineOptions) -> Result<Tensor> {
-    let ((count, len, dim), state_dim) = (batch.window.dims3()?, batch.history.state.dim(2)?);
+    let ((count, len, dim), columns) = (batch.window.dims3()?, batch.columns()?);
     let mut weights = Vec::with_capacity(count * len * dim);
     for row in 0..count {
-        let at = |position: usize, column: usize| match (position, column < state_dim) {
-            (0, true) => f32::from(batch.imagined[row] > 0),
-            (0, false) => options.first_action_weight,
+        let at = |position: usize, column: usize| match position {
+            _ if columns.known(position, batch.imagined[row] == 0).contains(&column) => 0.0,
+            0 if columns.action.contains(&column) => options.first_action_weight,
             _ => 1.0,
         };
         let row: Vec<f32> = (0..len * dim).map(|index| at(index / dim, index % dim)).collect();

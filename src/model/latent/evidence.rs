@@ -27,4 +27,9 @@ impl Evidence {
             Self::Successor => &[Seen::ALL, Seen::ALL],
         }
     }
+
+    /// The same of a window that ends after `horizon` positions.
+    pub fn ahead_within(self, horizon: usize) -> &'static [Seen] {
+        &self.ahead()[..self.ahead().len().min(horizon)]
+    }
 }

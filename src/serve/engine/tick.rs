@@ -364,36 +364,72 @@ mod tests {
         }
     }
 
+    /// A worker that was four times as slow as at warm-up, and what became of acts offered to it.
+    struct Slow {
+        agent: Arc<Agent>,
+        batch: Batch<Waits>,
+        tariff: Tariff,
+        outcomes: (mpsc::Sender<Result<Finished, Failure>>, mpsc::Receiver<Result<Finished, Failure>>),
+    }
+
+    impl Slow {
+        fn new() -> Self {
+            let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
+            let options = EngineOptions {
+                workers: 1,
+                queue_len_max: 1,
+                queue_bytes_max: 1,
+                batch_len_max: 2,
+                deadline_margin: Duration::ZERO,
+                wait_max: Duration::ZERO,
+            };
+            let (mut batch, tariff) = (Batch::new(options), Tariff::default());
+            batch.warm_up(&agent, &tariff, || true).unwrap();
+            (0..100).for_each(|_| batch.slowness.note(Duration::from_secs(1), Duration::from_millis(1)));
+            Self { agent, batch, tariff, outcomes: mpsc::channel() }
+        }
+
+        /// Offers an act whose caller waits so long, or for twice what it takes, and so half of what it would take at this slowness.
+        fn offer(&mut self, patience: Option<Duration>) {
+            let question = Question {
+                episode: Arc::new(self.agent.open(1, &self.agent.spec().sampler).unwrap()),
+                observation: Observation { state: vec![0.1; 4], ..Observation::default() },
+            };
+            let act = question.begin(&self.agent).unwrap();
+            let needs = self.tariff.of(&self.agent).unwrap().act(act.evaluations_left(), 1);
+            let now = Instant::now();
+            let ticket = Waits(now + patience.unwrap_or(2 * needs + Duration::from_micros(200)), self.outcomes.0.clone());
+            let job = Job { agent: self.agent.clone(), question, act, ticket, submitted: now, turn_by: now, client: 0 };
+            self.batch.admit(job, 1, &self.tariff);
+        }
+
+        /// Acts that were too late since it was last asked.
+        fn late(&self) -> usize {
+            self.outcomes.1.try_iter().filter(|outcome| matches!(outcome, Err(Failure::Late))).count()
+        }
+    }
+
     /// A worker that was slow for a while refuses a few acts for it, and then tries again: what it does not compute it cannot measure.
     #[test]
     fn a_slow_time_does_not_refuse_for_ever() {
-        let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
-        let options = EngineOptions {
-            workers: 1,
-            queue_len_max: 1,
-            queue_bytes_max: 1,
-            batch_len_max: 1,
-            deadline_margin: Duration::ZERO,
-            wait_max: Duration::ZERO,
-        };
-        let (mut batch, tariff) = (Batch::new(options), Tariff::default());
-        batch.warm_up(&agent, &tariff, || true).unwrap();
-        (0..100).for_each(|_| batch.slowness.note(Duration::from_secs(1), Duration::from_millis(1)));
-        let (told, outcome) = mpsc::channel();
-        let mut late = 0;
-        while batch.len() == 0 {
-            let question = Question {
-                episode: Arc::new(agent.open(1, &agent.spec().sampler).unwrap()),
-                observation: Observation { state: vec![0.1; 4], ..Observation::default() },
-            };
-            let act = question.begin(&agent).unwrap();
-            // Twice what it takes, and so half of what it would take at the worker's slowness.
-            let needs = tariff.of(&agent).unwrap().act(act.evaluations_left(), 1);
-            let now = Instant::now();
-            let ticket = Waits(now + 2 * needs + Duration::from_micros(200), told.clone());
-            batch.admit(Job { agent: agent.clone(), question, act, ticket, submitted: now, turn_by: now, client: 0 }, 1, &tariff);
-            late += outcome.try_iter().filter(|outcome| matches!(outcome, Err(Failure::Late))).count();
+        let (mut slow, mut late) = (Slow::new(), 0);
+        while slow.batch.len() == 0 {
+            slow.offer(None);
+            late += slow.late();
             assert!(late < 1000, "it never tries again");
         }
+    }
+
+    /// While somebody is computed, a crowd that is too late tells nothing: each of them made the worker believe that it is faster, so it let in
+    /// the next ones, too late as well (goodput at twice the capacity fell from .73 to .08).
+    #[test]
+    fn a_late_crowd_does_not_make_it_fast() {
+        let mut slow = Slow::new();
+        slow.offer(Some(Duration::from_secs(3600)));
+        assert_eq!(slow.batch.len(), 1);
+        let before = slow.batch.slowness.get();
+        (0..50).for_each(|_| slow.offer(Some(Duration::ZERO)));
+        assert_eq!((slow.late(), slow.batch.len()), (50, 1));
+        assert!(slow.batch.slowness.get() == before, "{before} became {}", slow.batch.slowness.get());
     }
 }

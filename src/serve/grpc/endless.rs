@@ -58,3 +58,25 @@ impl HttpBody for UntilLeave {
         frame
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::future::poll_fn;
+
+    /// What a health watch looks at may end in the moment in which it is time to leave: its stream then ended with OK, as if all were well.
+    #[tokio::test]
+    async fn a_stream_that_ends_while_leaving_says_farewell() {
+        let leave = CancellationToken::new();
+        leave.cancel();
+        let mut leaving = answers(Body::empty(), &leave);
+        let frame = poll_fn(|context| Pin::new(&mut leaving).poll_frame(context)).await.unwrap().unwrap();
+        assert_eq!(frame.trailers_ref().unwrap()["grpc-status"], "14");
+        assert!(poll_fn(|context| Pin::new(&mut leaving).poll_frame(context)).await.is_none());
+        // What it still has to say comes first, and at any other time its end is its own.
+        let mut talking = answers(Body::from("NOT_SERVING"), &leave);
+        assert!(poll_fn(|context| Pin::new(&mut talking).poll_frame(context)).await.unwrap().unwrap().is_data());
+        let mut staying = answers(Body::empty(), &CancellationToken::new());
+        assert!(poll_fn(|context| Pin::new(&mut staying).poll_frame(context)).await.is_none());
+    }
+}

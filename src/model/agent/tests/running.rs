@@ -76,6 +76,9 @@ fn a_running_posterior_is_refused() {
     let uniform = Schedule::Uniform { steps: 5 };
     let mut config = agent(false, 1, unet()).config.clone();
     (config.method.plan.schedule, config.trained.refined) = (uniform, false);
+    let mut absurd = config.clone();
+    (absurd.method.plan.schedule, absurd.defaults.sampler) = (Schedule::Uniform { steps: 41 }, options());
+    assert_eq!(absurd.check().unwrap_err().field, "method.plan.schedule.steps");
     let refused = |config: &ModelConfig, options| config.check_options(&options).err().map(|(field, _)| field);
     let plain = SamplerOptions { streaming: false, kappa: 0.0, ..SamplerOptions::default() };
     assert_eq!(refused(&config, plain.clone()), None);
