@@ -223,5 +223,7 @@ fn format_1_is_read_and_written_as_format_2() {
     copy_with(&old, out.path(), &config).unwrap();
     assert_eq!(load_manifest(out.path()).unwrap().0.format_version, 2);
     assert_eq!(*load(out.path()).unwrap().config(), config);
+    let plan = &config.method.plan;
+    assert_eq!((plan.horizon, plan.obs_horizon, plan.level_max, plan.clip), (8, 1, 40, 10.0));
     assert!(config.method.latent.block_len() == 10 && config.trained.action_horizons == [1, 2, 4] && config.trained.refined);
 }
