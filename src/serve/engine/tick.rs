@@ -369,7 +369,8 @@ mod tests {
         agent: Arc<Agent>,
         batch: Batch<Waits>,
         tariff: Tariff,
-        outcomes: (mpsc::Sender<Result<Finished, Failure>>, mpsc::Receiver<Result<Finished, Failure>>),
+        told: mpsc::Sender<Result<Finished, Failure>>,
+        outcomes: mpsc::Receiver<Result<Finished, Failure>>,
     }
 
     impl Slow {
@@ -386,7 +387,8 @@ mod tests {
             let (mut batch, tariff) = (Batch::new(options), Tariff::default());
             batch.warm_up(&agent, &tariff, || true).unwrap();
             (0..100).for_each(|_| batch.slowness.note(Duration::from_secs(1), Duration::from_millis(1)));
-            Self { agent, batch, tariff, outcomes: mpsc::channel() }
+            let (told, outcomes) = mpsc::channel();
+            Self { agent, batch, tariff, told, outcomes }
         }
 
         /// Offers an act whose caller waits so long, or for twice what it takes, and so half of what it would take at this slowness.
@@ -398,14 +400,14 @@ mod tests {
             let act = question.begin(&self.agent).unwrap();
             let needs = self.tariff.of(&self.agent).unwrap().act(act.evaluations_left(), 1);
             let now = Instant::now();
-            let ticket = Waits(now + patience.unwrap_or(2 * needs + Duration::from_micros(200)), self.outcomes.0.clone());
+            let ticket = Waits(now + patience.unwrap_or(2 * needs + Duration::from_micros(200)), self.told.clone());
             let job = Job { agent: self.agent.clone(), question, act, ticket, submitted: now, turn_by: now, client: 0 };
             self.batch.admit(job, 1, &self.tariff);
         }
 
         /// Acts that were too late since it was last asked.
         fn late(&self) -> usize {
-            self.outcomes.1.try_iter().filter(|outcome| matches!(outcome, Err(Failure::Late))).count()
+            self.outcomes.try_iter().filter(|outcome| matches!(outcome, Err(Failure::Late))).count()
         }
     }
 
