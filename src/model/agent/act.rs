@@ -91,6 +91,12 @@ impl Act {
         self.descent.evaluations()
     }
 
+    /// Windows that it holds, each a row of every network evaluation it takes part in: what an engine bounds. One window an act; candidates
+    /// and a second, unconditioned window (classifier-free guidance) would be more.
+    pub fn rows(&self) -> usize {
+        1
+    }
+
     /// Evaluations that it still asks for; of one that has not started those of a warm start, if there may be one.
     pub fn evaluations_left(&self) -> usize {
         match self.stored().filter(|_| !self.started) {

@@ -37,14 +37,14 @@ impl Tariff {
 /// Costs of one model on one worker.
 #[derive(Debug)]
 pub(super) struct Costs {
-    /// A tick of acts on their way, by batch length from 1.
+    /// A tick of acts on their way, by rows from 1.
     ticks: Vec<Duration>,
     /// What the first tick costs more: latents and their prior chain.
     starts: Vec<Duration>,
 }
 
 impl Costs {
-    /// Ticks of every length up to `len_max`; afterwards this thread's memory for them is there. `go_on` is asked between lengths.
+    /// Ticks of every number of rows up to `len_max`; afterwards this thread's memory for them is there. `go_on` is asked between lengths.
     pub fn measure(agent: &Agent, len_max: usize, mut go_on: impl FnMut() -> bool) -> Result<Self, AgentError> {
         let mut costs = Self { ticks: Vec::with_capacity(len_max), starts: Vec::with_capacity(len_max) };
         for len in (1..=len_max).take_while(|_| go_on()) {
@@ -67,7 +67,7 @@ impl Costs {
         Ok(costs)
     }
 
-    /// A tick of `len` acts, with the start of `fresh` among them.
+    /// A tick of `len` rows, with the start of `fresh` among them.
     pub fn tick(&self, len: usize, fresh: usize) -> Duration {
         of(&self.ticks, len) + if fresh > 0 { of(&self.starts, fresh) } else { Duration::ZERO }
     }

@@ -151,7 +151,7 @@ pub struct EngineOptions {
     pub queue_len_max: usize,
     /// Their memory together.
     pub queue_bytes_max: usize,
-    /// Acts of a batch.
+    /// Rows of a batch ([`Act::rows`]).
     pub batch_len_max: usize,
     /// Time kept for what follows the last evaluation of an act in a hurry: commit and answer.
     pub deadline_margin: Duration,

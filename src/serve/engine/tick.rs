@@ -73,6 +73,11 @@ impl<T: Ticket> Batch<T> {
         self.groups.iter().map(|group| group.riders.len()).sum()
     }
 
+    /// Rows of these acts.
+    pub fn rows(&self) -> usize {
+        self.groups.iter().flat_map(|group| &group.acts).map(Act::rows).sum()
+    }
+
     /// Gets ready for a model; see [`Costs::measure`].
     pub fn warm_up(&self, agent: &Arc<Agent>, tariff: &Tariff, go_on: impl FnMut() -> bool) -> Result<(), Failure> {
         tariff.note(agent, guarded(|| Costs::measure(agent, self.options.batch_len_max, go_on))?);
@@ -160,11 +165,11 @@ impl<T: Ticket> Batch<T> {
 }
 
 impl<T: Ticket> Group<T> {
-    fn tick(&mut self, slowness: &mut Slowness, pace: Pace, len_max: usize, order: impl Fn(u64) -> Option<Order>) {
+    fn tick(&mut self, slowness: &mut Slowness, pace: Pace, rows_max: usize, order: impl Fn(u64) -> Option<Order>) {
         self.drop_unwanted();
         self.hurry(slowness, pace);
         self.harvest();
-        let len = self.line_up(len_max, order);
+        let len = self.line_up(rows_max, order);
         if len == 0 {
             return;
         }
@@ -183,15 +188,16 @@ impl<T: Ticket> Group<T> {
         self.harvest();
     }
 
-    /// Brings those that take part to the front; how many they are.
-    fn line_up(&mut self, len_max: usize, order: impl Fn(u64) -> Option<Order>) -> usize {
-        let mut len = 0;
+    /// Brings those that take part to the front, as many as have room in so many rows; how many they are.
+    fn line_up(&mut self, rows_max: usize, order: impl Fn(u64) -> Option<Order>) -> usize {
+        let (mut len, mut rows) = (0, 0);
         for turn in [Order::First, Order::Then] {
             let first = len;
             for i in first..self.riders.len() {
-                if len < len_max && order(self.riders[i].client) == Some(turn) {
+                if has_room(rows, self.acts[i].rows(), rows_max) && order(self.riders[i].client) == Some(turn) {
                     self.riders.swap(len, i);
                     self.acts.swap(len, i);
+                    rows += self.acts[len].rows();
                     len += 1;
                 }
             }
@@ -206,8 +212,8 @@ impl<T: Ticket> Group<T> {
 
     /// The same of the first ones.
     fn expected_of(&self, len: usize) -> Duration {
-        let fresh = self.acts[..len].iter().filter(|act| act.evaluations() == 0).count();
-        self.costs.as_ref().map_or(Duration::ZERO, |costs| costs.tick(len, fresh))
+        let rows = |fresh: bool| self.acts[..len].iter().filter(|act| !fresh || act.evaluations() == 0).map(Act::rows).sum();
+        self.costs.as_ref().map_or(Duration::ZERO, |costs| costs.tick(rows(false), rows(true)))
     }
 
     /// Tells acts in a hurry how many evaluations they have time for; one that has time for none gives out what it has.
@@ -306,7 +312,7 @@ impl<T: Ticket> Rider<T> {
 fn advance(agent: &Agent, acts: &mut [Act]) -> Result<(), Failure> {
     guarded(|| agent.advance(acts))?;
     metrics::counter!("ada_batches_total").increment(1);
-    metrics::histogram!("ada_batch_size").record(acts.len() as f64);
+    metrics::histogram!("ada_batch_size").record(acts.iter().map(Act::rows).sum::<usize>() as f64);
     Ok(())
 }
 
@@ -321,6 +327,11 @@ fn count_waste(act: &Act) {
 
 fn waste(evaluations: u32) {
     metrics::counter!("ada_wasted_network_evaluations_total").increment(evaluations.into());
+}
+
+/// Whether an act finds room in a tick; one of more rows than there can be has a tick for itself.
+fn has_room(taken: usize, rows: usize, rows_max: usize) -> bool {
+    taken == 0 || taken + rows <= rows_max
 }
 
 /// Whether nobody will wait for an answer that takes so much more time.
@@ -344,6 +355,12 @@ mod tests {
     use super::*;
     use crate::model::{agent::Observation, checkpoint};
     use std::{path::Path, sync::mpsc};
+
+    #[test]
+    fn rows_bound_a_tick() {
+        assert!(has_room(0, 1, 2) && has_room(1, 1, 2) && !has_room(2, 1, 2));
+        assert!(!has_room(1, 2, 2) && has_room(0, 64, 2), "too many for any tick is not for ever");
+    }
 
     /// Waits until the time is over, and says what came of it.
     struct Waits(Instant, mpsc::Sender<Result<Finished, Failure>>);

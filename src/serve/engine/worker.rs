@@ -43,10 +43,10 @@ fn run<T: Ticket>(shared: &Shared<T>, index: usize, batch: &mut Batch<T>) {
             let _gone = done.send(batch.warm_up(&agent, &shared.tariff, go_on));
         }
         loop {
-            let (held, len_max) = (batch.len(), shared.options.batch_len_max);
+            let (held, rows, len_max) = (batch.len(), batch.rows(), shared.options.batch_len_max);
             let turns = batch.turns();
-            let reserve = (len_max + turns.reserve()).saturating_sub(held.max(len_max));
-            let room = Room { any: len_max.saturating_sub(held), light: reserve };
+            let reserve = (len_max + turns.reserve()).saturating_sub(rows.max(len_max));
+            let room = Room { any: len_max.saturating_sub(rows), light: reserve };
             let Some(arrivals) = shared.queue.take(index, held, room, |client| turns.is_heavy(client)) else { return };
             let full = held + arrivals.len();
             for job in arrivals {

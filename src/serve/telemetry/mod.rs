@@ -55,7 +55,7 @@ pub const CATALOGUE: [(&str, Kind, &str); 35] = [
     ("ada_act_network_evaluations", Histogram, "denoiser evaluations of an act"),
     ("ada_network_evaluations_total", Counter, "denoiser evaluations of acts that were computed, by model (one per act and tick)"),
     ("ada_wasted_network_evaluations_total", Counter, "evaluations of acts that were dropped"),
-    ("ada_batch_size", Histogram, "acts that share one network evaluation"),
+    ("ada_batch_size", Histogram, "rows that share one network evaluation: one an act"),
     ("ada_batches_total", Counter, "network evaluations of whole batches"),
     ("ada_degraded_total", Counter, "acts that a deadline cut short"),
     ("ada_queue_depth", Gauge, "acts that wait for a worker"),
