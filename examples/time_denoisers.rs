@@ -190,7 +190,7 @@ fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
     let params = Params::fresh(0);
     let networks = Networks::new(config.layout, &config.method, &params)?;
     let vars = params.vars();
-    let mut adam = Adam::new(&vars, |_| 0, 0.0, f64::INFINITY);
+    let mut adam = Adam::new(&vars, |_| Some(0), 0.0, f64::INFINITY);
     let shards: Vec<(Tensor, Tensor, Tensor)> = (0..flags.threads)
         .map(|_| {
             let shape = |width| [flags.batch / flags.threads, flags.len, width];

@@ -37,8 +37,23 @@
 //!
 //! Networks are written once, over any [`model::nn::Value`]: [`model::nn::Buffer`]s here, candle's tensors in training.
 //!
-//! Training is the mirror: recipe -> data set -> stage 1 ([`model::latent::elbo`]) -> stage 2 ([`model::diffusion::refine`]) ->
+//! Training is the mirror: recipe -> data set -> its stages, each a sum of losses ([`model::latent::elbo`], [`model::diffusion::refine`]) ->
 //! [`model::checkpoint`]. Losses live beside the networks they train; [`train`] turns the crank.
+//!
+//! # Where is ...
+//! | what | where |
+//! |---|---|
+//! | a choice of a method, and what may go with what | [`model::method`], [`model::check`] |
+//! | the noise schedule: which position stands at which level after so many evaluations | [`model::diffusion::schedule::Table`] |
+//! | the forward process (`q_sample`), a step of the sampler | [`model::diffusion::process`], [`model::diffusion::descent`] |
+//! | a latent inferred from tokens, told by the prior, refined | [`model::latent::Encoder`], [`model::latent::Prior`], `model/agent/answers.rs` |
+//! | what is known of the present and the future when it is | [`model::latent::Evidence`] |
+//! | a second window for an act (candidates, classifier-free guidance) | [`model::agent::Act::rows`], `model/agent/rows.rs` |
+//! | a layer: its shape, forward and backward | [`model::nn`], `op.rs` and one file a layer; loops in `kernels` |
+//! | what is minimized, and which networks move | [`train::recipe::stages`], [`train::recipe::losses`] |
+//! | a batch cut from episodes | [`train::dataset::window`] |
+//! | a restart of a window that is not trusted | `model/agent/restart.rs` |
+//! | an option of a session, from the wire to the sampler | `serve/wire.rs`, [`model::options`] |
 //!
 //! # Paper and code
 //! Two clocks, two letters: `t` is environment time, `k` is noise level.

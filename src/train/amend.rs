@@ -4,11 +4,12 @@
 //! along the schedule of the new number, so the run is not the one that a fresh start would be, and the checkpoint says so.
 
 use super::{
-    position::{Position, Stage},
-    recipe::Recipe,
+    position::Position,
+    recipe::{Recipe, keys::leaves},
 };
 use serde::{Deserialize, Serialize};
 use std::{
+    cmp::Ordering,
     collections::{BTreeMap, BTreeSet},
     fmt,
 };
@@ -36,21 +37,22 @@ impl fmt::Display for Change {
     }
 }
 
-/// Compares the recipe of a state, as TOML, with that of the run that goes on, key by key. A finished run that gets more steps goes back
-/// into stage 2.
+/// Compares the recipe of a state, as TOML, with that of the run that goes on, key by key. A finished run that gets more steps goes on in
+/// its last stage.
 ///
 /// # Errors
 /// Names every key that may not differ, with both values.
-pub fn amend(before: &str, now: &Recipe, position: &mut Position) -> Result<Vec<Change>, String> {
+pub fn amend(before: &str, now: &Recipe, position: &Position) -> Result<Vec<Change>, String> {
     let theirs: Recipe = toml::from_str(before).map_err(|error| format!("it cannot be read any more ({})", error.message()))?;
-    let (old, new) = (leaves(&theirs), leaves(now));
+    let table = |recipe: &Recipe| toml::from_str(&recipe.to_toml()).expect("a recipe is TOML: is a bug");
+    let (old, new) = (leaves(&table(&theirs)), leaves(&table(now)));
     let keys: BTreeSet<&String> = old.keys().chain(new.keys()).collect();
     let mut refused = Vec::new();
     let mut changes = Vec::new();
     for key in keys.into_iter().filter(|key| !FREE.contains(&key.as_str()) && old.get(*key) != new.get(*key)) {
         let shown = |leaves: &BTreeMap<String, toml::Value>| leaves.get(key).map_or("not there".into(), ToString::to_string);
         let (from, to) = (shown(&old), shown(&new));
-        match steps_of(key, now).map(|(stage, to)| may_change(stage, to, position)) {
+        match steps_of(key, now).map(|(stage, to)| may_change(stage, to, now, position)) {
             Some(Ok(())) => changes.extend(change(key, &theirs, now, position)),
             Some(Err(reason)) => refused.push(format!("`{key}` was {from} and is {to}, but {reason}")),
             None => refused.push(format!("`{key}` was {from} and is {to}")),
@@ -61,50 +63,29 @@ pub fn amend(before: &str, now: &Recipe, position: &mut Position) -> Result<Vec<
         let hint = if defaults { " (`ada-trainer defaults` changes these in the finished checkpoint)" } else { "" };
         return Err(refused.join(", ") + hint);
     }
-    if position.stage == Stage::Done && position.step < now.stage2.steps {
-        position.stage = Stage::Refine;
-    }
     Ok(changes)
 }
 
 /// The stage whose number of steps this key is, and that number.
-fn steps_of(key: &str, recipe: &Recipe) -> Option<(Stage, usize)> {
-    match key {
-        "stage1.steps" => recipe.stage1.as_ref().map(|stage| (Stage::Latent, stage.steps)),
-        "stage2.steps" => Some((Stage::Refine, recipe.stage2.steps)),
-        _ => None,
-    }
+fn steps_of(key: &str, recipe: &Recipe) -> Option<(usize, usize)> {
+    let name = key.strip_prefix("stages.")?.strip_suffix(".steps")?;
+    let index = recipe.stages.iter().position(|stage| stage.name == name)?;
+    Some((index, recipe.stages[index].steps))
 }
 
 /// Whether a stage may end after `steps` steps instead.
-fn may_change(stage: Stage, steps: usize, position: &Position) -> Result<(), String> {
-    let here = stage == position.stage || (stage == Stage::Refine && position.stage == Stage::Done);
-    match (here, stage < position.stage) {
-        (true, _) if steps < position.step => Err(format!("{} has done {} steps already", stage.name(), position.step)),
-        (false, true) => Err(format!("{} is over", stage.name())),
-        _ => Ok(()),
+fn may_change(stage: usize, steps: usize, recipe: &Recipe, position: &Position) -> Result<(), String> {
+    let name = &recipe.stages[stage].name;
+    match stage.cmp(&position.stage) {
+        Ordering::Less => Err(format!("{name} is over")),
+        Ordering::Equal if steps < position.step => Err(format!("{name} has done {} steps already", position.step)),
+        Ordering::Equal | Ordering::Greater => Ok(()),
     }
 }
 
 /// Nothing, if the stage has not begun: then the run is what a fresh start would be.
 fn change(key: &str, before: &Recipe, now: &Recipe, position: &Position) -> Option<Change> {
     let ((stage, to), (_, from)) = (steps_of(key, now)?, steps_of(key, before)?);
-    let begun = stage < position.stage || (stage == position.stage && position.step > 0);
+    let begun = stage == position.stage && position.step > 0;
     begun.then(|| Change { key: key.into(), from, to, at: position.step })
-}
-
-/// All values by their dotted names.
-fn leaves(recipe: &Recipe) -> BTreeMap<String, toml::Value> {
-    let mut leaves = BTreeMap::new();
-    let table: toml::Table = toml::from_str(&recipe.to_toml()).expect("a recipe is TOML: is a bug");
-    let mut tables = vec![(String::new(), table)];
-    while let Some((prefix, table)) = tables.pop() {
-        for (key, value) in table {
-            match value {
-                toml::Value::Table(inner) => tables.push((format!("{prefix}{key}."), inner)),
-                value => drop(leaves.insert(format!("{prefix}{key}"), value)),
-            }
-        }
-    }
-    leaves
 }

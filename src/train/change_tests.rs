@@ -13,12 +13,12 @@ fn a_state_of_another_recipe_is_refused_by_key() {
     let dir = tempfile::tempdir().unwrap();
     train(&[], dir.path(), Some(12)).unwrap();
     let refusal = |overrides: &[&str]| train(overrides, dir.path(), Some(1)).unwrap_err().to_string();
-    let error = refusal(&["stage2.batch=5", "seed=4"]);
-    assert!(error.contains("another recipe: `seed` was 3 and is 4, `stage2.batch` was 4 and is 5;"), "{error}");
-    let error = refusal(&["stage1.steps=20"]);
-    assert!(error.contains("`stage1.steps` was 9 and is 20, but stage1 is over"), "{error}");
-    let error = refusal(&["stage2.steps=2"]);
-    assert!(error.contains("`stage2.steps` was 9 and is 2, but stage2 has done 3 steps already"), "{error}");
+    let error = refusal(&["losses.denoise.batch=5", "seed=4"]);
+    assert!(error.contains("another recipe: `losses.denoise.batch` was 4 and is 5, `seed` was 3 and is 4;"), "{error}");
+    let error = refusal(&["stages.identify.steps=20"]);
+    assert!(error.contains("`stages.identify.steps` was 9 and is 20, but identify is over"), "{error}");
+    let error = refusal(&["stages.denoise.steps=2"]);
+    assert!(error.contains("`stages.denoise.steps` was 9 and is 2, but denoise has done 3 steps already"), "{error}");
     assert!(refusal(&["sampler.temperature=0.25"]).contains("ada-trainer defaults"));
     let error = refusal(&["data=\"tests/golden/data_f64.h5\""]);
     assert!(error.contains("another data set"), "{error}");
@@ -42,20 +42,20 @@ fn a_run_goes_on_with_another_log_and_a_moved_data_set() {
 fn a_run_goes_on_with_more_steps_and_says_so() {
     let dir = tempfile::tempdir().unwrap();
     train(&[], dir.path(), Some(12)).unwrap();
-    assert_eq!(train(&["stage2.steps=12"], dir.path(), None).unwrap(), Outcome::Finished);
-    assert_eq!(train(&["stage2.steps=14"], dir.path(), None).unwrap(), Outcome::Finished);
+    assert_eq!(train(&["stages.denoise.steps=12"], dir.path(), None).unwrap(), Outcome::Finished);
+    assert_eq!(train(&["stages.denoise.steps=14"], dir.path(), None).unwrap(), Outcome::Finished);
     let metrics = checkpoint::load_manifest(dir.path()).unwrap().0.provenance.metrics;
     assert_eq!(metrics["steps"], 14);
     let changes = serde_json::json!([
-        {"key": "stage2.steps", "from": 9, "to": 12, "at": 3},
-        {"key": "stage2.steps", "from": 12, "to": 14, "at": 12},
+        {"key": "stages.denoise.steps", "from": 9, "to": 12, "at": 3},
+        {"key": "stages.denoise.steps", "from": 12, "to": 14, "at": 12},
     ]);
     assert_eq!(metrics["changed_under_way"], changes);
     // Changed before its stage began, it is the run that a fresh start would be.
     let fresh = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
     train(&[], fresh[0].path(), Some(4)).unwrap();
-    train(&["stage2.steps=5"], fresh[0].path(), None).unwrap();
-    train(&["stage2.steps=5"], fresh[1].path(), None).unwrap();
+    train(&["stages.denoise.steps=5"], fresh[0].path(), None).unwrap();
+    train(&["stages.denoise.steps=5"], fresh[1].path(), None).unwrap();
     assert!(shipped(fresh[0].path()) == shipped(fresh[1].path()));
     let metrics = checkpoint::load_manifest(fresh[0].path()).unwrap().0.provenance.metrics;
     assert_eq!(metrics["changed_under_way"], serde_json::Value::Null);
@@ -88,7 +88,8 @@ fn the_best_checkpoint_is_kept_beside_the_last() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("run");
     // A rate that only does harm after a while.
-    let overrides = ["checkpoint_every=1", "stage2.learning_rate.peak=1.0", "stage2.learning_rate.end=1.0", "stage2.steps=8"];
+    let overrides =
+        ["checkpoint_every=1", "stages.denoise.learning_rate.peak=1.0", "stages.denoise.learning_rate.end=1.0", "stages.denoise.steps=8"];
     for stop in [Some(13), None] {
         train_as(&overrides, Options { keep_best: true, ..options(&out, stop) }).unwrap();
     }

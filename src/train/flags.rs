@@ -17,10 +17,11 @@ use std::path::PathBuf;
 #[derive(Parser)]
 #[command(version, verbatim_doc_comment)]
 pub enum Cli {
-    /// Train a recipe, or go on with it: stage 1 (what cannot be seen), its gate, stage 2 (denoise and refine), checkpoint.
+    /// Train a recipe, or go on with it: its stages in order (in the shipped ones: identify what cannot be seen, with a
+    /// gate; then denoise and refine), checkpoint.
     ///
-    /// A run that goes on may be given another stage1.steps (in stage 1), stage2.steps, checkpoint_every or log_every, and its data set may
-    /// have moved; other keys are refused by name. Log and TensorBoard files are in OUT/training.
+    /// A run that goes on may be given other steps of its stage or a later one (stages.NAME.steps), checkpoint_every or log_every, and its
+    /// data set may have moved; other keys are refused by name. Log and TensorBoard files are in OUT/training.
     Run(Run),
     /// How well a checkpoint's latent knows the hidden context that a data set tells (infos/context)
     Probe(Probe),
@@ -44,10 +45,10 @@ pub struct Run {
     /// HDF5 file instead of the recipe's
     #[arg(long)]
     pub data: Option<PathBuf>,
-    /// Another value for a key of the recipe, e.g. --set stage2.steps=100; may be given often
+    /// Another value for a key of the recipe, e.g. --set stages.denoise.steps=100; may be given often
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub overrides: Vec<String>,
-    /// Keep the checkpoint of the least held-out loss of stage 2 as well, in OUT-best beside OUT; it is served like any other
+    /// Keep the checkpoint of the least held-out loss of the last stage as well, in OUT-best beside OUT; it is served like any other
     #[arg(long)]
     pub keep_best: bool,
     /// Stop after this many steps as if interrupted; the same command goes on

@@ -3,11 +3,12 @@
 use super::{
     Task,
     optimizer::{Adam, Ema},
-    position::{Position, Stage},
+    position::Position,
+    recipe::stages::{Group, Stage},
     resume::{Notes, Snapshot, State, restore_vars},
 };
 use crate::model::{Networks, nn::params::Params};
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use candle_core::{Tensor, Var};
 use std::collections::BTreeMap;
 
@@ -16,8 +17,6 @@ pub type Scalars = Vec<(&'static str, f64)>;
 
 /// Largest norm of a gradient.
 const CLIP_NORM: f64 = 1.0;
-/// Variables of the latent networks, group 0 of the optimizer; the denoiser is group 1.
-const LATENT: &str = "latent.";
 
 /// The trained half of a run; the fixed half is the [`Task`].
 pub struct Learner {
@@ -27,7 +26,7 @@ pub struct Learner {
     pub vars: BTreeMap<String, Var>,
     /// Optimizer of the variables that this stage trains.
     pub adam: Adam,
-    /// Average of all variables; stage 2 only.
+    /// Average of all variables, if the stage keeps one.
     pub ema: Option<Ema>,
     /// How far.
     pub position: Position,
@@ -36,17 +35,16 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// Fresh weights of one attempt, at the start of the first stage that the recipe has.
+    /// Fresh weights of one attempt, at the start of the first stage.
     ///
     /// # Errors
     /// If the networks cannot be built from the recipe.
-    pub fn fresh(task: &Task, attempt: usize) -> Result<Self> {
-        let params = Params::fresh(task.recipe.seed_of(attempt));
+    pub fn fresh(task: &Task, position: Position) -> Result<Self> {
+        let params = Params::fresh(task.recipe.seed_of(position.attempt));
         let networks = Networks::new(task.config.layout, &task.config.method, &params)?;
         let vars = params.vars();
-        let stage = if task.recipe.stage1.is_some() { Stage::Latent } else { Stage::Refine };
-        let (adam, ema) = equip(task, stage, &vars)?;
-        Ok(Self { networks, vars, adam, ema, position: Position { stage, attempt, step: 0, before: 0 }, notes: Notes::default() })
+        let (adam, ema) = equip(&task.recipe.stages[position.stage], &vars)?;
+        Ok(Self { networks, vars, adam, ema, position, notes: Notes::default() })
     }
 
     /// The learner of a state on disk.
@@ -54,25 +52,34 @@ impl Learner {
     /// # Errors
     /// If the state does not fit the recipe.
     pub fn resumed(task: &Task, state: State) -> Result<Self> {
-        let mut learner = Self::fresh(task, state.position.attempt)?;
-        learner.enter(task, state.position.stage)?;
+        ensure!(state.position.stage < task.recipe.stages.len(), "the training state is at a stage that the recipe does not have");
+        let mut learner = Self::fresh(task, state.position)?;
         restore_vars(&learner.vars, &state.tensors)?;
         learner.adam.restore(&state.tensors, state.adam_steps)?;
         if let Some(ema) = &mut learner.ema {
             ema.restore(&state.tensors)?;
         }
-        learner.position = state.position;
         learner.notes = state.notes;
         Ok(learner)
     }
 
-    /// Goes on to another stage with the weights as they are; the last stage keeps its optimizer.
+    /// Goes on to the next stage with the weights as they are.
     ///
     /// # Errors
     /// If a tensor operation fails.
-    pub fn enter(&mut self, task: &Task, stage: Stage) -> Result<()> {
-        (self.adam, self.ema) = equip(task, stage, &self.vars)?;
-        self.position = self.position.then(stage, self.position.attempt);
+    pub fn enter_next(&mut self, task: &Task) -> Result<()> {
+        self.position = self.position.next_stage();
+        (self.adam, self.ema) = equip(&task.recipe.stages[self.position.stage], &self.vars)?;
+        Ok(())
+    }
+
+    /// Begins anew from other weights; what the run has found out stays known.
+    ///
+    /// # Errors
+    /// If the networks cannot be built from the recipe.
+    pub fn begin_anew(&mut self, task: &Task) -> Result<()> {
+        let notes = std::mem::take(&mut self.notes);
+        *self = Self { notes, ..Self::fresh(task, self.position.next_attempt())? };
         Ok(())
     }
 
@@ -94,14 +101,27 @@ impl Learner {
     }
 }
 
-/// Optimizer and average of a stage: stage 1 trains the latent networks alone.
-fn equip(task: &Task, stage: Stage, vars: &BTreeMap<String, Var>) -> Result<(Adam, Option<Ema>)> {
-    let group = |name: &str| usize::from(!name.starts_with(LATENT));
-    if stage == Stage::Latent {
-        let latent = vars.iter().filter(|(name, _)| group(name) == 0).map(|(name, var)| (name.clone(), var.clone())).collect();
-        let weight_decay = task.recipe.stage1.as_ref().map_or(0.0, |stage| stage.weight_decay);
-        return Ok((Adam::new(&latent, group, weight_decay, CLIP_NORM), None));
+/// Optimizer and average of a stage; the optimizer's groups are in the order of [`Stage::trains`].
+fn equip(stage: &Stage, vars: &BTreeMap<String, Var>) -> Result<(Adam, Option<Ema>)> {
+    let group = |name: &str| Group::of(name).and_then(|group| stage.trains.keys().position(|trained| *trained == group));
+    let ema = stage.ema_decay_max.map(|decay_max| Ema::new(vars, decay_max)).transpose()?;
+    Ok((Adam::new(vars, group, stage.weight_decay, CLIP_NORM), ema))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{model::config::ModelConfig, train::tests::recipe_with};
+
+    /// A variable without a group would never be trained.
+    #[test]
+    fn every_variable_has_a_group() {
+        let recipe = recipe_with(&[]).unwrap();
+        let config: ModelConfig = recipe.config(crate::model::trajectory::Layout { state_dim: 3, action_dim: 2 });
+        let params = Params::fresh(0);
+        Networks::new(config.layout, &config.method, &params).unwrap();
+        let groups: std::collections::BTreeSet<_> =
+            params.vars().keys().map(|name| Group::of(name).unwrap_or_else(|| panic!("{name}"))).collect();
+        assert_eq!(groups, Group::ALL.into_iter().collect());
     }
-    let stage2 = &task.recipe.stage2;
-    Ok((Adam::new(vars, group, stage2.weight_decay, CLIP_NORM), Some(Ema::new(vars, stage2.ema_decay_max)?)))
 }

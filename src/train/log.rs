@@ -3,10 +3,7 @@
 //! Steps of TensorBoard count on from stage to stage and attempt to attempt ([`Position::total`]): its readers understand a step that falls as
 //! a restart, and drop every curve from there on.
 
-use super::{
-    position::{Position, Stage},
-    tensorboard::EventWriter,
-};
+use super::{position::Position, tensorboard::EventWriter};
 use anyhow::{Context, Result};
 use indicatif::{FormattedDuration, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 use serde_json::{Map, Value, json};
@@ -26,6 +23,8 @@ pub type Clock = dyn Fn() -> f64 + Send;
 
 /// The log of one run.
 pub struct Log {
+    /// Names of the stages, in order.
+    stages: Vec<String>,
     lines: File,
     /// The last line before this process.
     last: String,
@@ -40,6 +39,8 @@ pub struct Log {
 /// How fast a stage goes.
 #[derive(Default)]
 struct Pace {
+    /// Name of the stage.
+    stage: String,
     /// Steps of the stage.
     steps: usize,
     /// Where this process began with it: step and time.
@@ -49,10 +50,10 @@ struct Pace {
 }
 
 impl Pace {
-    /// `stage2 step 300 of 3000, 41.2 steps/s, 00:01:05 left`
+    /// `denoise step 300 of 3000, 41.2 steps/s, 00:01:05 left`
     fn text(&self, position: &Position, now: f64) -> String {
         let (step, steps, elapsed) = (position.step, self.steps, now - self.from.1);
-        let mut text = format!("{} step {step} of {steps}", position.stage.name());
+        let mut text = format!("{} step {step} of {steps}", self.stage);
         let rate = step.saturating_sub(self.from.0) as f64 / elapsed;
         if let Some(left) = Duration::try_from_secs_f64(steps.saturating_sub(step) as f64 / rate).ok().filter(|_| rate.is_finite()) {
             text += &format!(", {}, {} left", rate_text(rate), FormattedDuration(left));
@@ -77,11 +78,11 @@ fn tell(text: &str) {
 }
 
 impl Log {
-    /// Opens `log.jsonl` and a new event file in `dir`, at `position`: lines of later steps, written before a kill, are dropped.
+    /// Opens `log.jsonl` and a new event file in `dir`, at `position` in a run of these stages: lines of later steps, written before a kill, are dropped.
     ///
     /// # Errors
     /// If a file cannot be written.
-    pub fn open(dir: &Path, position: &Position, clock: Box<Clock>) -> Result<Self> {
+    pub fn open(dir: &Path, stages: Vec<String>, position: &Position, clock: Box<Clock>) -> Result<Self> {
         fs::create_dir_all(dir).with_context(|| format!("cannot make {}", dir.display()))?;
         let path = dir.join("log.jsonl");
         let text = match fs::read(&path) {
@@ -89,7 +90,7 @@ impl Log {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => String::new(),
             Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
         };
-        let kept: String = text.lines().filter(|line| is_before(line, position)).flat_map(|line| [line, "\n"]).collect();
+        let kept: String = text.lines().filter(|line| is_before(line, &stages, position)).flat_map(|line| [line, "\n"]).collect();
         fs::write(&path, &kept).with_context(|| format!("cannot write {}", path.display()))?;
         let last = kept.lines().next_back().unwrap_or_default().to_owned();
         let lines = OpenOptions::new().append(true).open(&path)?;
@@ -101,17 +102,18 @@ impl Log {
         bar.set_style(style.with_key("rate", |state: &ProgressState, out: &mut dyn fmt::Write| {
             let _nobody_reads = out.write_str(&rate_text(state.per_sec()));
         }));
-        Ok(Self { lines, last, events, bar, clock, pace: Pace::default(), sums: Vec::new(), count: 0 })
+        Ok(Self { stages, lines, last, events, bar, clock, pace: Pace::default(), sums: Vec::new(), count: 0 })
     }
 
     /// A stage begins at `position` and has `steps` steps.
     pub fn begin(&mut self, position: &Position, steps: usize) {
         let now = (self.clock)();
-        self.pace = Pace { steps, from: (position.step, now), said: now };
+        let stage = self.stages[position.stage].clone();
+        self.bar.set_prefix(stage.clone());
+        self.pace = Pace { stage, steps, from: (position.step, now), said: now };
         self.bar.set_length(steps as u64);
         self.bar.set_position(position.step as u64);
         self.bar.reset_eta();
-        self.bar.set_prefix(position.stage.name());
         if self.bar.is_hidden() {
             tell(&self.pace.text(position, now));
         }
@@ -147,7 +149,7 @@ impl Log {
     /// # Errors
     /// If a file cannot be written.
     pub fn write(&mut self, position: &Position, scalars: &[(&'static str, f64)]) -> Result<()> {
-        let stage = position.stage.name();
+        let stage = &self.stages[position.stage];
         let mut line = Map::from_iter([
             ("stage".to_string(), json!(stage)),
             ("attempt".to_string(), json!(position.attempt)),
@@ -160,7 +162,7 @@ impl Log {
             return Ok(());
         }
         writeln!(self.lines, "{line}")?;
-        let prefix = if position.attempt == 0 { stage.to_string() } else { format!("{stage}.attempt{}", position.attempt) };
+        let prefix = if position.attempt == 0 { stage.clone() } else { format!("{stage}.attempt{}", position.attempt) };
         let tags: Vec<(String, f64)> = scalars.iter().map(|(name, value)| (format!("{prefix}/{name}"), *value)).collect();
         let now = (self.clock)();
         self.events.scalars(position.total() as u64, now, tags.iter().map(|(tag, value)| (tag.as_str(), *value)))?;
@@ -181,12 +183,12 @@ impl Log {
 }
 
 /// Whether a line of the log was written at or before `position`; a torn last line was not.
-fn is_before(line: &str, position: &Position) -> bool {
+fn is_before(line: &str, stages: &[String], position: &Position) -> bool {
     let Ok(line) = serde_json::from_str::<Value>(line) else { return false };
     let number = |key: &str| line[key].as_u64().map(|value| value as usize);
-    let stage = line["stage"].as_str().and_then(Stage::named);
-    match (stage, number("attempt"), number("step")) {
-        (Some(stage), Some(attempt), Some(step)) => (stage, attempt, step) <= (position.stage, position.attempt, position.step),
+    let stage = line["stage"].as_str().and_then(|name| stages.iter().position(|stage| stage == name));
+    match (number("attempt"), stage, number("step")) {
+        (Some(attempt), Some(stage), Some(step)) => (attempt, stage, step) <= (position.attempt, position.stage, position.step),
         _ => false,
     }
 }
@@ -198,27 +200,28 @@ mod tests {
     /// A run of hours into a file was silent, or told a step without total, rate or end; the bar said `1.2345e-3/s`.
     #[test]
     fn progress_has_total_rate_and_time_left() {
-        let pace = Pace { steps: 3000, from: (100, 50.0), said: 50.0 };
-        let text = |step, now| pace.text(&Position { stage: Stage::Refine, attempt: 0, step, before: 0 }, now);
-        assert_eq!(text(300, 54.0), "stage2 step 300 of 3000, 50.0 steps/s, 00:00:54 left");
-        assert_eq!(text(100, 50.0), "stage2 step 100 of 3000", "nothing is known yet");
-        assert_eq!(text(101, 850.0), "stage2 step 101 of 3000, 800.0 s/step, 26d 20:13:20 left");
+        let pace = Pace { stage: "denoise".into(), steps: 3000, from: (100, 50.0), said: 50.0 };
+        let text = |step, now| pace.text(&Position { step, ..Position::START }, now);
+        assert_eq!(text(300, 54.0), "denoise step 300 of 3000, 50.0 steps/s, 00:00:54 left");
+        assert_eq!(text(100, 50.0), "denoise step 100 of 3000", "nothing is known yet");
+        assert_eq!(text(101, 850.0), "denoise step 101 of 3000, 800.0 s/step, 26d 20:13:20 left");
         assert_eq!([0.0012345, 0.5, 12.34, 432.1].map(rate_text), ["810.0 s/step", "2.0 s/step", "12.3 steps/s", "432 steps/s"]);
     }
 
     #[test]
     fn a_resumed_log_drops_what_comes_after_the_state() {
         let dir = tempfile::tempdir().unwrap();
-        let at = |stage, step| Position { stage, attempt: 0, step, before: 0 };
-        let mut log = Log::open(dir.path(), &at(Stage::Latent, 0), Box::new(|| 0.0)).unwrap();
+        let at = |stage, step| Position { stage, step, ..Position::START };
+        let stages = || vec!["identify".to_string(), "denoise".to_string()];
+        let mut log = Log::open(dir.path(), stages(), &at(0, 0), Box::new(|| 0.0)).unwrap();
         for step in 1..=4 {
-            log.step(&at(Stage::Latent, step), 2, &[("loss", step as f64)]).unwrap();
+            log.step(&at(0, step), 2, &[("loss", step as f64)]).unwrap();
         }
-        log.write(&at(Stage::Refine, 2), &[("loss", 9.0)]).unwrap();
+        log.write(&at(1, 2), &[("loss", 9.0)]).unwrap();
         writeln!(log.lines, "{{\"stage\": \"sta").unwrap();
-        Log::open(dir.path(), &at(Stage::Latent, 3), Box::new(|| 1.0)).unwrap();
+        Log::open(dir.path(), stages(), &at(0, 3), Box::new(|| 1.0)).unwrap();
         let text = fs::read_to_string(dir.path().join("log.jsonl")).unwrap();
         let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-        assert_eq!(lines, [json!({"stage": "stage1", "attempt": 0, "step": 2, "loss": 1.5})]);
+        assert_eq!(lines, [json!({"stage": "identify", "attempt": 0, "step": 2, "loss": 1.5})]);
     }
 }

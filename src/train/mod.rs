@@ -1,16 +1,19 @@
-//! How checkpoints are made: recipe -> data set -> stage 1 -> stage 2 -> checkpoint. Losses live beside the networks they train
-//! (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here the crank is turned.
+//! How checkpoints are made: recipe -> data set -> its stages, one after the other -> checkpoint. Losses live beside the networks they
+//! train (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here batches are drawn for them and the crank is turned.
 pub mod amend;
 pub mod ceiling;
 #[cfg(test)]
 mod change_tests;
+mod crank;
 pub mod dataset;
 pub mod defaults;
 pub mod flags;
+pub mod gate;
 pub mod learner;
 #[cfg(test)]
 mod legal_tests;
 pub mod log;
+pub mod losses;
 pub mod optimizer;
 pub mod parallel;
 pub mod position;
@@ -22,34 +25,27 @@ pub mod ridge;
 #[cfg(test)]
 mod same_tests;
 mod ship;
-pub mod stage1;
-pub mod stage2;
 pub mod tensorboard;
 #[cfg(test)]
 mod tests;
 
 use crate::model::{checkpoint::is_name, config::ModelConfig, method::Looks};
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
+use crank::Crank;
 use dataset::{
     Split, UnitsFrom, hdf5,
     room::Room,
     units::{self, ActionColumn},
 };
-use learner::{Learner, Scalars};
+use learner::Learner;
 use log::{Clock, Log};
-use position::Stage;
-use recipe::{Gate, Recipe};
+use position::Position;
+use recipe::Recipe;
 use resume::Store;
-use ship::Product;
-use stage1::ElboTask;
-use stage2::RefineTask;
 use std::{
     fs::{self, File},
     path::{Path, PathBuf},
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::{Arc, atomic::AtomicBool},
 };
 
 /// Where a run keeps its state and its logs, inside the output directory; the checkpoint itself lies beside it.
@@ -61,7 +57,7 @@ pub struct Options {
     pub out: PathBuf,
     /// Stop after this many steps of this process, as if interrupted.
     pub stop_after_steps: Option<usize>,
-    /// Keep the checkpoint of the least held-out loss of stage 2 as well, in a directory beside `out`: its name with `-best`.
+    /// Keep the checkpoint of the least held-out loss of the last stage as well, in a directory beside `out`: its name with `-best`.
     pub keep_best: bool,
     /// Set by the binary when the user interrupts: the run saves its state and ends after the step in progress.
     pub stop: Arc<AtomicBool>,
@@ -105,7 +101,7 @@ impl Task {
         let mut dataset = hdf5::read(&recipe.data, room)?;
         let (len, why) = recipe.episode_len_min();
         dataset.leave_out_shorter(len, &why)?;
-        if recipe.gate.is_some() {
+        if recipe.gate().is_some() {
             ensure!(dataset.context_dim() > 0, "recipe: `gate`: {} has no `infos/context` to probe for", recipe.data.display());
         }
         let (layout, notes, dataset_digest) = (dataset.layout(), std::mem::take(&mut dataset.notes), dataset.digest.clone());
@@ -114,11 +110,11 @@ impl Task {
         // The recipe was checked with plain units; now the data's are known.
         config.check().with_context(|| format!("data set {} makes no model", recipe.data.display()))?;
         let task = Self { recipe, split, action_columns, dataset_digest, config, notes };
-        if task.recipe.gate.is_some() {
+        if task.recipe.gate().is_some() {
             ensure!(
-                stage1::contexts_vary(&task)?,
+                gate::contexts_vary(&task)?,
                 "recipe: `gate`: in the held-out episodes of {} `infos/context` never changes, so an error in units of its variance is no \
-                 number; record episodes with other contexts, or leave [gate] out",
+                 number; record episodes with other contexts, or leave the gate out",
                 task.recipe.data.display()
             );
         }
@@ -144,9 +140,10 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     let resumed = state.as_ref().map(|state| state.position);
     let mut learner = match state {
         Some(state) => Learner::resumed(&task, state)?,
-        None => Learner::fresh(&task, 0)?,
+        None => Learner::fresh(&task, Position::START)?,
     };
-    let log = Log::open(&dir, &learner.position, options.clock)?;
+    let stages = task.recipe.stages.iter().map(|stage| stage.name.clone()).collect();
+    let log = Log::open(&dir, stages, &learner.position, options.clock)?;
     task.notes.iter().for_each(|note| log.say(note));
     let (train, held_out) = (task.split.train.len(), task.split.held_out.len());
     log.say(&format!("{}: {train} episodes to train on, {held_out} held out", task.recipe.data.display()));
@@ -162,7 +159,7 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
         }
     }
     if let Some(position) = resumed {
-        log.say(&format!("going on at {} step {}", position.stage.name(), position.step));
+        log.say(&format!("going on at {} step {}", task.recipe.stages[position.stage].name, position.step));
         learner.notes.changes.iter().for_each(|change| log.say(&change.to_string()));
     }
     let best = options.keep_best.then(|| best_dir(&options.out));
@@ -189,162 +186,4 @@ fn lock(dir: &Path) -> Result<File> {
     let file = File::create(dir.join("lock"))?;
     file.try_lock().with_context(|| format!("{}: another run is at work here", dir.display()))?;
     Ok(file)
-}
-
-/// Turns the crank: steps, logs, checkpoints.
-struct Crank<'a> {
-    task: &'a Task,
-    store: Store,
-    log: Log,
-    out: &'a Path,
-    /// Where the best checkpoint goes, if it is kept.
-    best: Option<PathBuf>,
-    /// The checkpoint of the last step, if this process wrote it.
-    finished: Option<Product>,
-    stop: Arc<AtomicBool>,
-    steps_left: Option<usize>,
-}
-
-impl Crank<'_> {
-    fn run(&mut self, learner: &mut Learner) -> Result<Outcome> {
-        loop {
-            let outcome = match learner.position.stage {
-                Stage::Latent => self.stage1(learner)?,
-                Stage::Refine => self.stage2(learner)?,
-                Stage::Done => {
-                    let product = match self.finished.take() {
-                        Some(product) => product,
-                        None => self.ship(learner)?,
-                    };
-                    self.log.say(&format!("checkpoint in {}: {:#}", self.out.display(), product.metrics()));
-                    return Ok(Outcome::Finished);
-                }
-            };
-            if outcome == Outcome::Stopped {
-                self.log.say(&format!(
-                    "stopped at {} step {}; the same command goes on",
-                    learner.position.stage.name(),
-                    learner.position.step
-                ));
-                return Ok(outcome);
-            }
-        }
-    }
-
-    fn stage1(&mut self, learner: &mut Learner) -> Result<Outcome> {
-        let task = self.task;
-        let (Some(elbo), Some(stage)) = (ElboTask::new(task), &task.recipe.stage1) else {
-            bail!("stage 1 of a recipe without latents: is a bug");
-        };
-        let mut measure = |crank: &mut Self, learner: &mut Learner| match elbo.held_out_loss(&learner.networks)? {
-            Some(loss) => crank.log.write(&learner.position, &[("held_out_elbo", loss)]),
-            None => Ok(()),
-        };
-        if self.turn(learner, stage.steps, |learner| elbo.step(learner), &mut measure)? == Outcome::Stopped {
-            return Ok(Outcome::Stopped);
-        }
-        if !self.passes_gate(learner)? {
-            let position = learner.position.then(Stage::Latent, learner.position.attempt + 1);
-            let notes = std::mem::take(&mut learner.notes);
-            *learner = Learner { notes, position, ..Learner::fresh(task, position.attempt)? };
-        } else {
-            learner.enter(task, Stage::Refine)?;
-        }
-        self.store.save(&learner.snapshot())?;
-        Ok(Outcome::Finished)
-    }
-
-    /// Probes where the data have a context; without a gate everything passes.
-    fn passes_gate(&mut self, learner: &mut Learner) -> Result<bool> {
-        let task = self.task;
-        let Some(latent) = learner.networks.latent.as_ref().filter(|_| task.split.train[0].context_dim > 0) else { return Ok(true) };
-        let result = stage1::gate(task, latent)?;
-        let successor_state = result.successor_state.map(|error| ("probe_successor_state", error));
-        let probed: Vec<_> = [("probe_filter", result.filter)].into_iter().chain(successor_state).collect();
-        self.log.write(&learner.position, &probed)?;
-        learner.notes.probes.push(serde_json::to_value(result)?);
-        let Some(gate) = &task.recipe.gate else { return Ok(true) };
-        if !result.passes(gate) && learner.position.attempt + 1 >= gate.tries {
-            return Err(gate_failure(gate, &learner.notes.probes.clone().into()));
-        }
-        if !result.passes(gate) {
-            self.log.say("the probe is above the gate: stage 1 starts anew from another seed");
-        }
-        Ok(result.passes(gate))
-    }
-
-    fn stage2(&mut self, learner: &mut Learner) -> Result<Outcome> {
-        let refine = RefineTask::new(self.task);
-        let mut ship = |crank: &mut Self, learner: &mut Learner| {
-            crank.finished = Some(crank.ship(learner)?);
-            Ok(())
-        };
-        let outcome = self.turn(learner, self.task.recipe.stage2.steps, |learner| refine.step(learner), &mut ship)?;
-        if outcome == Outcome::Finished {
-            learner.position.stage = Stage::Done;
-            self.store.save(&learner.snapshot())?;
-        }
-        Ok(outcome)
-    }
-
-    /// Steps until the stage has `steps`; the one loop of training. At every checkpoint and at the end `measure` is asked, before the
-    /// state is saved: what it logs is then neither lost nor told twice by a run that is killed in between.
-    fn turn(
-        &mut self,
-        learner: &mut Learner,
-        steps: usize,
-        mut step: impl FnMut(&mut Learner) -> Result<Scalars>,
-        measure: &mut dyn FnMut(&mut Self, &mut Learner) -> Result<()>,
-    ) -> Result<Outcome> {
-        let recipe = &self.task.recipe;
-        self.log.begin(&learner.position, steps);
-        while learner.position.step < steps {
-            if self.should_stop() {
-                self.store.save(&learner.snapshot())?;
-                return Ok(Outcome::Stopped);
-            }
-            let scalars = step(learner)?;
-            if let Some((name, value)) = scalars.iter().find(|(_, value)| !value.is_finite()) {
-                let (stage, at) = (learner.position.stage.name(), learner.position.step);
-                bail!("{name} is {value} at {stage} step {at}; the last good state is kept in {}", self.out.join(TRAINING_DIR).display());
-            }
-            learner.position.step += 1;
-            self.log.step(&learner.position, recipe.log_every, &scalars)?;
-            if learner.position.step.is_multiple_of(recipe.checkpoint_every) || learner.position.step == steps {
-                measure(self, learner)?;
-                self.store.save(&learner.snapshot())?;
-            }
-        }
-        Ok(Outcome::Finished)
-    }
-
-    /// Writes a checkpoint that can be served, and again beside it if it is the best so far.
-    fn ship(&mut self, learner: &mut Learner) -> Result<Product> {
-        let product = ship::product(self.task, learner)?;
-        product.save(self.out)?;
-        let loss = product.held_out_loss;
-        if learner.position.stage == Stage::Refine {
-            self.log.write(&learner.position, &[("held_out_loss", loss)])?;
-        }
-        if let Some(best) = self.best.as_ref().filter(|_| learner.notes.best.is_none_or(|least| loss < least)) {
-            product.save(best)?;
-            learner.notes.best = Some(loss);
-        }
-        Ok(product)
-    }
-
-    fn should_stop(&mut self) -> bool {
-        let spent = self.steps_left.is_some_and(|left| left == 0);
-        self.steps_left = self.steps_left.map(|left| left.saturating_sub(1));
-        spent || self.stop.load(Ordering::Relaxed)
-    }
-}
-
-fn gate_failure(gate: &Gate, probes: &serde_json::Value) -> anyhow::Error {
-    anyhow::anyhow!(
-        "stage 1 did not pass the gate (filter {}, successor_state {}) in {} tries: {probes}; more data or steps, or a wider gate, may help",
-        gate.filter,
-        gate.successor_state,
-        gate.tries
-    )
 }

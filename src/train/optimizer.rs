@@ -99,13 +99,14 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// Zero moments; `group` sorts names into groups.
-    pub fn new(vars: &BTreeMap<String, Var>, group: impl Fn(&str) -> usize, weight_decay: f64, clip_norm: f64) -> Self {
+    /// Zero moments; `group` sorts names into groups, those of none are not trained.
+    pub fn new(vars: &BTreeMap<String, Var>, group: impl Fn(&str) -> Option<usize>, weight_decay: f64, clip_norm: f64) -> Self {
         let slot = |(name, var): (&String, &Var)| {
             let zeros = || vec![0.0; var.elem_count()];
-            Slot { name: name.clone(), var: var.clone(), group: group(name), moments: [zeros(), zeros()], grad: zeros(), reached: false }
+            let group = group(name)?;
+            Some(Slot { name: name.clone(), var: var.clone(), group, moments: [zeros(), zeros()], grad: zeros(), reached: false })
         };
-        Self { slots: vars.iter().map(slot).collect(), steps: 0, weight_decay, clip_norm }
+        Self { slots: vars.iter().filter_map(slot).collect(), steps: 0, weight_decay, clip_norm }
     }
 
     /// One step on the sum of these gradients; variables that no loss reaches stay as they are. `rates` holds a learning rate for each
@@ -283,7 +284,7 @@ mod tests {
     fn adamw_by_hand() {
         let var = var(&[1.0, -2.0]);
         let vars = BTreeMap::from([("w".to_string(), var.clone())]);
-        let mut adam = Adam::new(&vars, |_| 0, 0.5, f64::INFINITY);
+        let mut adam = Adam::new(&vars, |_| Some(0), 0.5, f64::INFINITY);
         let mut expected = [1.0_f64, -2.0];
         let mut moments = [[0.0_f64; 2]; 2];
         for step in 1..=2 {
@@ -306,7 +307,7 @@ mod tests {
     fn clips_by_the_global_norm_and_ignores_what_is_not_finite() {
         let (a, b) = (var(&[3.0]), var(&[4.0]));
         let vars = BTreeMap::from([("a".to_string(), a.clone()), ("b".to_string(), b.clone())]);
-        let mut adam = Adam::new(&vars, |name| usize::from(name == "b"), 0.0, 1.0);
+        let mut adam = Adam::new(&vars, |name| Some(usize::from(name == "b")), 0.0, 1.0);
         let loss = (a.sqr().unwrap() + b.sqr().unwrap()).unwrap().sum_all().unwrap().affine(0.5, 0.0).unwrap();
         let norm = adam.step(&[loss.backward().unwrap()], &[0.1, 0.0]).unwrap();
         assert!((norm - 5.0).abs() < 1e-6);

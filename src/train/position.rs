@@ -3,40 +3,12 @@
 use crate::model::noise::Philox;
 use serde::{Deserialize, Serialize};
 
-/// The stations of a run, in order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Stage {
-    /// Latent identification.
-    Latent,
-    /// Denoise and refine.
-    Refine,
-    /// Nothing is left to train.
-    Done,
-}
-
-impl Stage {
-    /// As it stands in logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Latent => "stage1",
-            Self::Refine => "stage2",
-            Self::Done => "done",
-        }
-    }
-
-    /// The opposite of [`Self::name`].
-    pub fn named(name: &str) -> Option<Self> {
-        [Self::Latent, Self::Refine, Self::Done].into_iter().find(|stage| stage.name() == name)
-    }
-}
-
-/// How far a run is.
+/// How far a run is; positions are in the order in which a run comes to them, stage by stage within an attempt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Position {
-    /// Where.
-    pub stage: Stage,
-    /// How often stage 1 was restarted from another seed.
+    /// Index of the stage in the recipe.
+    pub stage: usize,
+    /// How often the run began anew from another seed, for a gate.
     pub attempt: usize,
     /// Steps of this stage that are done.
     pub step: usize,
@@ -46,18 +18,26 @@ pub struct Position {
 }
 
 impl Position {
-    /// All steps of the run so far; never falls, whatever stage 1 is tried again.
+    /// Where every run begins.
+    pub const START: Self = Self { stage: 0, attempt: 0, step: 0, before: 0 };
+
+    /// All steps of the run so far; never falls, however often it begins anew.
     pub fn total(&self) -> usize {
         self.before + self.step
     }
 
-    /// The start of another stage or attempt after this one.
-    pub fn then(&self, stage: Stage, attempt: usize) -> Self {
-        Self { stage, attempt, step: 0, before: self.total() }
+    /// The start of the next stage.
+    pub fn next_stage(&self) -> Self {
+        Self { stage: self.stage + 1, step: 0, before: self.total(), ..*self }
+    }
+
+    /// The start of the next attempt.
+    pub fn next_attempt(&self) -> Self {
+        Self { stage: 0, attempt: self.attempt + 1, step: 0, before: self.total() }
     }
 
     /// The randomness of the step to come: a stream of its own.
     pub fn stream(&self, seed: u64) -> Philox {
-        Philox::named(seed, &format!("{}.{}.{}", self.stage.name(), self.attempt, self.step))
+        Philox::named(seed, &format!("stage{}.{}.{}", self.stage + 1, self.attempt, self.step))
     }
 }

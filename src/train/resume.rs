@@ -47,7 +47,7 @@ pub struct Notes {
     pub probes: Vec<serde_json::Value>,
     /// Keys of the recipe that were changed under way.
     pub changes: Vec<Change>,
-    /// Least held-out loss of stage 2, where the best checkpoint is kept.
+    /// Least held-out loss of the last stage, where the best checkpoint is kept.
     pub best: Option<f64>,
 }
 
@@ -73,7 +73,7 @@ pub struct Snapshot<'a> {
     pub vars: &'a BTreeMap<String, Var>,
     /// Their optimizer.
     pub adam: &'a Adam,
-    /// Their average, in stage 2.
+    /// Their average, if the stage keeps one.
     pub ema: Option<&'a Ema>,
 }
 
@@ -108,8 +108,8 @@ impl Store {
         let cure = "remove it to start anew, or choose another --out";
         let (theirs, ours) = (&header.identity.dataset, &self.dataset);
         ensure!(theirs == ours, "{path} was made with another data set (SHA-256 {theirs}, now {ours}); {cure}");
-        let mut position = header.position;
-        let changes = amend(&header.identity.recipe, &self.recipe, &mut position)
+        let position = header.position;
+        let changes = amend(&header.identity.recipe, &self.recipe, &position)
             .map_err(|reason| anyhow!("{path} was made with another recipe: {reason}; {cure}"))?;
         let mut notes = header.notes;
         notes.changes.extend(changes);

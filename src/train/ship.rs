@@ -1,11 +1,10 @@
 //! From a learner to a checkpoint: averaged weights, the yardstick of latent jumps, and what was measured.
 
 use super::{
-    Task,
+    Task, gate,
     learner::Learner,
+    losses::denoise::DenoiseLoss,
     probe::{latent_means, places, spread},
-    stage1,
-    stage2::RefineTask,
 };
 use crate::model::{
     Networks,
@@ -52,7 +51,7 @@ impl Product {
 pub fn product(task: &Task, learner: &Learner) -> Result<Product> {
     let (networks, tensors) = learner.averaged(task)?;
     let latent_spread = networks.latent.as_ref().map_or(Ok(0.0), |latent| latent_spread(task, latent))?;
-    let errors = RefineTask::new(task).held_out_errors(&networks)?;
+    let errors = DenoiseLoss::new(task, 1.0).held_out_errors(&networks)?;
     let held_out_loss = errors.iter().sum::<f64>() / errors.len() as f64;
     let metrics = metrics(task, learner, &networks, &errors)?;
     let mut config = task.config.clone();
@@ -79,7 +78,7 @@ fn metrics(task: &Task, learner: &Learner, networks: &Networks, errors: &[f64]) 
     let round = |value: f64| (value * 1e5).round() / 1e5;
     let probe = match &networks.latent {
         Some(latent) if task.split.train[0].context_dim > 0 => {
-            let result = stage1::gate(task, latent)?;
+            let result = gate::probe(task, latent)?;
             json!({"filter": round(result.filter), "successor_state": result.successor_state.map(round)})
         }
         _ => Value::Null,
@@ -87,8 +86,8 @@ fn metrics(task: &Task, learner: &Learner, networks: &Networks, errors: &[f64]) 
     let errors: Vec<f64> = errors.iter().copied().map(round).collect();
     let mut metrics = json!({
         "actions": task.action_columns,
-        "stage1_attempts": learner.position.attempt + 1,
-        "stage1_probes": learner.notes.probes,
+        "attempts": learner.position.attempt + 1,
+        "gate_probes": learner.notes.probes,
         "probe": probe,
         "steps": learner.position.step,
         "held_out_error_by_row": errors,

@@ -80,7 +80,7 @@ fn a_stopped_run_goes_on_with_the_same_bits() {
 fn seeds_make_different_weights() {
     let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
     for (dir, seed) in dirs.iter().zip(["seed=1", "seed=2"]) {
-        train(&[seed, "stage1.steps=1", "stage2.steps=2"], dir.path(), None).unwrap();
+        train(&[seed, "stages.identify.steps=1", "stages.denoise.steps=2"], dir.path(), None).unwrap();
     }
     assert!(shipped(dirs[0].path())[0] != shipped(dirs[1].path())[0]);
 }
@@ -88,7 +88,7 @@ fn seeds_make_different_weights() {
 #[test]
 fn what_is_shipped_loads_and_says_where_it_comes_from() {
     let dir = tempfile::tempdir().unwrap();
-    train(&["stage1.steps=2", "stage2.steps=3"], dir.path(), None).unwrap();
+    train(&["stages.identify.steps=2", "stages.denoise.steps=3"], dir.path(), None).unwrap();
     let agent = checkpoint::load(dir.path()).unwrap();
     assert!(agent.spec().trained.refined);
     assert_eq!((agent.config().layout.state_dim, agent.config().layout.action_dim), (3, 2));
@@ -106,17 +106,25 @@ fn what_is_shipped_loads_and_says_where_it_comes_from() {
     assert_eq!((lines("latent"), lines("ceiling")), (3 * 3 * 3, 3 * 2), "block lengths 1, 2, 3; three shifts; what was seen");
 }
 
-/// A model without latents has no stage 1, and is not said to be refined.
+/// A recipe's text without one section.
+fn without(text: &str, section: &str) -> String {
+    let (before, rest) = text.split_once(section).unwrap();
+    let next = rest.find("\n[").unwrap();
+    format!("{before}{}", &rest[next + 1..])
+}
+
+/// A model without latents has no ELBO to minimize, and is not said to be refined.
 #[test]
-fn a_baseline_skips_stage_1() {
+fn a_baseline_has_one_stage() {
     let text = RECIPE
         .replace("latent = { kind = \"gru\", dim = 2, hidden = 4, looks = { block = 3 } }\n", "")
-        .replace("elbo_weight = 0.1", "elbo_weight = 0.0");
-    let (start, end) = (text.find("[stage1]").unwrap(), text.find("[stage2]").unwrap());
+        .replace(", elbo = 0.1", "")
+        .replace(", latent = 0.1", "");
+    let text = ["[losses.elbo]", "[[stages]]\nname = \"identify\""].iter().fold(text, |text, section| without(&text, section));
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("recipe.toml");
-    fs::write(&path, format!("{}{}", &text[..start], &text[end..])).unwrap();
-    let recipe = Recipe::read(&path, &["stage2.steps=2".to_string()], None).unwrap();
+    fs::write(&path, text).unwrap();
+    let recipe = Recipe::read(&path, &["stages.denoise.steps=2".to_string()], None).unwrap();
     let out = dir.path().join("out");
     assert_eq!(run(recipe, options(&out, None)).unwrap(), Outcome::Finished);
     let agent = checkpoint::load(&out).unwrap();
@@ -127,9 +135,14 @@ fn a_baseline_skips_stage_1() {
 #[test]
 fn a_loss_that_diverges_keeps_the_last_good_state() {
     let dir = tempfile::tempdir().unwrap();
-    let wild = ["stage1.steps=40", "stage1.learning_rate.peak=1e38", "stage1.learning_rate.warm_up=5", "checkpoint_every=1"];
+    let wild = [
+        "stages.identify.steps=40",
+        "stages.identify.learning_rate.peak=1e38",
+        "stages.identify.learning_rate.warm_up=5",
+        "checkpoint_every=1",
+    ];
     let error = train(&wild, dir.path(), None).unwrap_err().to_string();
-    assert!(error.contains("stage1 step") && error.contains("last good state"), "{error}");
+    assert!(error.contains("identify step") && error.contains("last good state"), "{error}");
     let recipe = recipe_with(&wild).unwrap();
     let task = Task::new(recipe.clone(), &Room::default()).unwrap();
     let store = resume::Store::new(&dir.path().join("training"), &recipe, &task.dataset_digest);
@@ -140,11 +153,16 @@ fn a_loss_that_diverges_keeps_the_last_good_state() {
     }
 }
 
-/// A gate that nothing passes: stage 1 is tried as often as the recipe says, from other seeds, and then the run says what it saw.
+/// A gate that nothing passes: it is tried as often as the recipe says, from other seeds, and then the run says what it saw.
 #[test]
-fn the_gate_restarts_stage_1_and_gives_up() {
+fn the_gate_begins_anew_and_gives_up() {
     let dir = tempfile::tempdir().unwrap();
-    let gate = ["gate.filter=0.0", "gate.successor_state=0.0", "gate.tries=2", "stage1.steps=2"];
+    let gate = [
+        "stages.identify.gate.filter=0.0",
+        "stages.identify.gate.successor_state=0.0",
+        "stages.identify.gate.tries=2",
+        "stages.identify.steps=2",
+    ];
     let error = train(&gate, dir.path(), None).unwrap_err().to_string();
     assert!(error.contains("in 2 tries"), "{error}");
     let log = fs::read_to_string(dir.path().join("training/log.jsonl")).unwrap();
@@ -155,7 +173,12 @@ fn the_gate_restarts_stage_1_and_gives_up() {
 /// Held-out contexts that never change made the gate's error 0/0, which passed no bound: four attempts, then "more data or steps".
 #[test]
 fn a_gate_on_constant_contexts_says_so() {
-    let gate = ["data=\"tests/golden/data_still.h5\"", "gate.filter=0.5", "gate.successor_state=0.5", "gate.tries=4"];
+    let gate = [
+        "data=\"tests/golden/data_still.h5\"",
+        "stages.identify.gate.filter=0.5",
+        "stages.identify.gate.successor_state=0.5",
+        "stages.identify.gate.tries=4",
+    ];
     let error = Task::new(recipe_with(&gate).unwrap(), &Room::default()).err().unwrap().to_string();
     assert!(error.contains("`gate`") && error.contains("never changes"), "{error}");
 }
@@ -163,19 +186,19 @@ fn a_gate_on_constant_contexts_says_so() {
 #[test]
 fn wrong_recipes_name_the_key() {
     for (text, key) in [
-        ("stage2.bacth=3", "bacth"),
-        ("stage2.steps=many", "steps"),
+        ("losses.denoise.bacth=3", "bacth"),
+        ("stages.denoise.steps=many", "steps"),
         ("model.plan.level_max=7", "level_max"),
         ("model.plan.backbone.widths=[8, 8, 8, 8]", "model.plan.backbone.widths"),
         ("sampler.action_horizon=5", "sampler.action_horizon"),
         ("sampler.kappa=-1.0", "sampler.kappa"),
         ("name=\"Half Cheetah\"", "`name`"),
-        ("stage2.elbo_weight=inf", "stage2.elbo_weight"),
-        ("stage1.weight_decay=-1.0", "stage1.weight_decay"),
+        ("stages.denoise.minimizes.elbo=inf", "stages.denoise.minimizes.elbo"),
+        ("stages.identify.weight_decay=-1.0", "stages.identify.weight_decay"),
         ("model.plan.backbone={kind = \"dit\", width = 9, depth = 1, heads = 3}", "model.plan.backbone.width"),
-        ("stage2.ready_fraction=1.5", "stage2.ready_fraction"),
-        ("stage1.learning_rate.end=1.0", "stage1.learning_rate.end"),
-        ("stage2.routing=leaky", "leaky"),
+        ("losses.denoise.ready_fraction=1.5", "losses.denoise.ready_fraction"),
+        ("stages.identify.learning_rate.end=1.0", "stages.identify.learning_rate.end"),
+        ("losses.denoise.routing=leaky", "leaky"),
         ("steps", "--set steps"),
     ] {
         let error = recipe_with(&[text]).unwrap_err().to_string();
@@ -269,9 +292,9 @@ fn short_episodes_are_left_out_and_counted() {
     assert_eq!(dataset.notes, Vec::<String>::new());
     dataset.episodes[4].end -= 20;
     dataset.episodes[9].start += 8;
-    dataset.leave_out_shorter(17, "`stage1.length` + 1").unwrap();
+    dataset.leave_out_shorter(17, "`losses.elbo.length` + 1").unwrap();
     assert_eq!(dataset.episodes.len(), 10);
-    assert!(dataset.notes[0].contains("left out 2 of 12 episodes shorter than 17 steps (`stage1.length` + 1)"), "{:?}", dataset.notes);
+    assert!(dataset.notes[0].contains("left out 2 of 12 episodes shorter than 17 steps (`losses.elbo.length` + 1)"), "{:?}", dataset.notes);
     let split = dataset.split(UnitsFrom::Data(&ActionsConfig::default())).unwrap().0;
     assert_eq!((split.train.len(), split.held_out.len()), (9, 1));
     let mut dataset = read();
@@ -298,6 +321,9 @@ fn wrong_data_sets_are_refused_before_training() {
         let error = refused(&[&format!("data=\"tests/golden/{file}.{extension}\"")]);
         assert!(error.contains(words) && error.contains(file), "{file}: {error}");
     }
-    let error = refused(&["stage1.length=30"]);
-    assert!(error.contains("0 of 12 episode(s)") && error.contains("`stage1.length` + 1") && error.contains("longest has 24"), "{error}");
+    let error = refused(&["losses.elbo.length=30"]);
+    assert!(
+        error.contains("0 of 12 episode(s)") && error.contains("`losses.elbo.length` + 1") && error.contains("longest has 24"),
+        "{error}"
+    );
 }

@@ -18,7 +18,7 @@ const DEADLINE: Duration = Duration::from_secs(120);
 
 fn command(out: &Path) -> Command {
     let mut command = Command::new(TRAINER);
-    let sizes = ["stage1.steps=150", "stage2.steps=150", "checkpoint_every=10", "log_every=1"];
+    let sizes = ["stages.identify.steps=150", "stages.denoise.steps=150", "checkpoint_every=10", "log_every=1"];
     command.args(["run", RECIPE, "--out"]).arg(out).args(sizes.iter().flat_map(|text| ["--set", text]));
     command.stdout(Stdio::null()).stderr(Stdio::null());
     command
@@ -51,7 +51,7 @@ fn wait_for_lines(child: &mut Child, out: &Path, lines: usize) {
     }
 }
 
-/// kill -9 in stage 1, twice, and in stage 2, then Ctrl-C: the checkpoint has the bytes of a run that was left alone, and so has the log.
+/// kill -9 in the first stage, twice, and in the second, then Ctrl-C: the checkpoint has the bytes of a run that was left alone, and so has the log.
 #[test]
 fn killed_and_interrupted_runs_end_in_the_same_bytes() {
     let (alone, killed) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -77,7 +77,7 @@ fn every_polite_signal_saves_the_state() {
     for (signal, code) in [("-TERM", 143), ("-HUP", 129)] {
         let out = tempfile::tempdir().unwrap();
         let mut command = command(out.path());
-        let mut child = command.args(["--set", "checkpoint_every=100000", "--set", "stage1.steps=1000000"]).spawn().unwrap();
+        let mut child = command.args(["--set", "checkpoint_every=100000", "--set", "stages.identify.steps=1000000"]).spawn().unwrap();
         wait_for_lines(&mut child, out.path(), 5);
         send(signal, &child);
         assert_eq!(child.wait().unwrap().code(), Some(code));
@@ -90,7 +90,7 @@ fn every_polite_signal_saves_the_state() {
 fn nohup_is_respected() {
     let out = tempfile::tempdir().unwrap();
     let mut command = Command::new("nohup");
-    command.args([TRAINER, "run", RECIPE, "--set", "stage1.steps=1000000", "--set", "log_every=1", "--out"]).arg(out.path());
+    command.args([TRAINER, "run", RECIPE, "--set", "stages.identify.steps=1000000", "--set", "log_every=1", "--out"]).arg(out.path());
     let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     wait_for_lines(&mut child, out.path(), 5);
     send("-HUP", &child);
@@ -105,7 +105,7 @@ fn nohup_is_respected() {
 #[test]
 fn kills_at_random_moments_leave_a_checkpoint_that_loads() {
     let out = tempfile::tempdir().unwrap();
-    let sizes = ["stage1.steps=2", "stage2.steps=1000000", "checkpoint_every=1", "log_every=1000000"];
+    let sizes = ["stages.identify.steps=2", "stages.denoise.steps=1000000", "checkpoint_every=1", "log_every=1000000"];
     let begun = Instant::now();
     for round in 0..12_u64 {
         let mut command = Command::new(TRAINER);
@@ -140,7 +140,7 @@ fn file_names_are_taken_as_they_are() {
         fs::copy(RECIPE, &recipe).unwrap();
         let mut command = Command::new(TRAINER);
         command.arg("run").arg(&recipe).arg("--data").arg(&data).arg("--out").arg(&out);
-        let output = command.args(["--set", "stage1.steps=1", "--set", "stage2.steps=1"]).output().unwrap();
+        let output = command.args(["--set", "stages.identify.steps=1", "--set", "stages.denoise.steps=1"]).output().unwrap();
         assert!(output.status.success(), "{name:?}: {}", String::from_utf8_lossy(&output.stderr));
         let shown = checkpoint::load_manifest(&out).unwrap().0.provenance.dataset;
         assert_eq!(shown, data.file_name().unwrap().to_string_lossy(), "{name:?}");
@@ -153,7 +153,7 @@ fn probe_and_inspect_say_what_a_checkpoint_is() {
     let dir = out.path().to_str().unwrap();
     assert!(ask(&["run", RECIPE, "--out", dir, "--seed", "5", "--set", "sampler.temperature=0.1"]).status.success());
     let text = String::from_utf8(ask(&["inspect", dir]).stdout).unwrap();
-    assert!(text.contains("digest") && text.contains("seed        5") && text.contains("[stage2]"), "{text}");
+    assert!(text.contains("digest") && text.contains("seed        5") && text.contains("[losses.denoise]"), "{text}");
     // What is in force was told as JSON, and of the restart nothing at all.
     for words in [
         "kappa inf, latent mean",
@@ -188,7 +188,7 @@ fn mistakes_get_one_clear_line() {
     let run = |more: &[&'static str]| [&["run", RECIPE, "--out", to], more].concat();
     let (trainer, server) = (TRAINER, env!("CARGO_BIN_EXE_ada-server"));
     for (program, arguments, words) in [
-        (trainer, run(&["--set", "stage2.bacth=3"]), "unknown field `bacth`"),
+        (trainer, run(&["--set", "losses.denoise.bacth=3"]), "unknown field `bacth`"),
         (trainer, run(&["--data", "tests/golden/data_nan.h5"]), "NaN at row 30"),
         (trainer, run(&["--data", "nowhere.h5"]), "nowhere.h5"),
         (trainer, run(&["--set", "model.plan.level_max=3"]), "sub_steps * horizon <= level_max"),

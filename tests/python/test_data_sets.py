@@ -52,14 +52,14 @@ def train(data: Path, out: Path, *flags: str) -> subprocess.CompletedProcess[str
 
 def log(data: Path, out: Path) -> str:
     """The log of a run that has read everything and drawn from all episodes."""
-    few = ["--set", "stage1.steps=2", "--set", "stage2.steps=2", "--set", "log_every=1"]
+    few = ["--set", "stages.identify.steps=2", "--set", "stages.denoise.steps=2", "--set", "log_every=1"]
     done = train(data, out, *few)
     assert done.returncode == 0, done.stderr
     return (out / "training/log.jsonl").read_text()
 
 
 def refusal(data: Path, out: Path) -> str:
-    done = train(data, out, "--set", "stage1.steps=2", "--set", "stage2.steps=2")
+    done = train(data, out, "--set", "stages.identify.steps=2", "--set", "stages.denoise.steps=2")
     assert done.returncode == 1, done.stderr
     lines = done.stderr.splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: data set ") and data.name in lines[0], done.stderr
@@ -294,7 +294,7 @@ def test_short_episodes_are_left_out_and_said(tmp_path):
     columns = arrays()
     columns["terminals"][2] = True
     done = train(write(tmp_path / "x.h5", columns), tmp_path / "out")
-    assert done.returncode == 0 and "left out 1 of 13 episodes shorter than 6 steps (`stage1.length` + 1)" in done.stderr, done.stderr
+    assert done.returncode == 0 and "left out 1 of 13 episodes shorter than 6 steps (`losses.elbo.length` + 1)" in done.stderr, done.stderr
     probe = [str(TRAINER), "probe", str(tmp_path / "out"), str(tmp_path / "x.h5"), "--json"]
     told = subprocess.run(probe, capture_output=True, text=True, cwd=ROOT, timeout=300, check=True)
     assert "left out 1 of 13 episodes" in told.stderr and json.loads(told.stdout)
@@ -436,7 +436,7 @@ def test_a_data_set_larger_than_its_memory_trains(tmp_path):
 
 def test_rows_in_a_file_give_the_same_log(plain, tmp_path):
     data, out = write(tmp_path / "x.h5", arrays(), **GZIP), tmp_path / "out"
-    few = ["--set", "stage1.steps=2", "--set", "stage2.steps=2", "--set", "log_every=1"]
+    few = ["--set", "stages.identify.steps=2", "--set", "stages.denoise.steps=2", "--set", "log_every=1"]
     done = train(data, out, "--data-memory-mib", "0", *few)
     assert done.returncode == 0 and "more than --data-memory-mib allows (0): kept in a file" in done.stderr, done.stderr
     assert (out / "training/log.jsonl").read_text() == plain
@@ -505,7 +505,7 @@ def test_actions_in_another_unit_train_the_same_bits(plain: str, tmp_path: Path,
     columns = arrays()
     columns["actions"] = (columns["actions"] * scale + shift).astype(np.float32)
     assert log(write(tmp_path / "other.h5", columns), tmp_path / "out") == plain
-    done = train(tmp_path / "other.h5", tmp_path / "out2", "--set", "stage1.steps=1", "--set", "stage2.steps=1")
+    done = train(tmp_path / "other.h5", tmp_path / "out2", "--set", "stages.identify.steps=1", "--set", "stages.denoise.steps=1")
     low, high = float(shift), float(shift + scale)
     assert f"actions: bounds [{low}, {low}] .. [{high}, {high}], to -1 .. 1" in done.stderr
     warned = "warning: actions, column 1: is scaled by" in done.stderr
@@ -516,6 +516,8 @@ def test_one_broken_reading_is_counted_and_held(tmp_path: Path) -> None:
     columns = arrays()
     columns["actions"] = np.linspace(-1, 1, 2 * ROWS).reshape(ROWS, 2).astype(np.float32)
     columns["actions"][5, 0] = 1e6
-    done = train(write(tmp_path / "broken.h5", columns), tmp_path / "out", "--set", "stage1.steps=1", "--set", "stage2.steps=1")
+    done = train(
+        write(tmp_path / "broken.h5", columns), tmp_path / "out", "--set", "stages.identify.steps=1", "--set", "stages.denoise.steps=1"
+    )
     assert done.returncode == 0, done.stderr
     assert "column 0: reaches from" in done.stderr and "1 value(s) are held within the bounds" in done.stderr

@@ -63,7 +63,7 @@ SAYS = {
     "README.md": ['"actions":', '"latent_mean":', '"evaluations":8', '"step":2', '"cheetah-wind-s"'],
     "docs/simulator.md": [
         "data/lift.h5: 100 episodes, 10000 steps; return -9.67 +- 0.36, median -9.03, 0 failed",
-        "stage2 step 600 of 600",
+        "denoise step 600 of 600",
         "lift-seed0@",
         "failures            0 of 64",
         "film: out/lift.gif",

@@ -11,7 +11,7 @@ from server import ROOT
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 TRAINER = ROOT / "target" / "release" / "ada-trainer"
-SIZES = ("stage1.steps=30", "stage2.steps=20", "checkpoint_every=5", "log_every=1")
+SIZES = ("stages.identify.steps=30", "stages.denoise.steps=20", "checkpoint_every=5", "log_every=1")
 
 
 def train(out: Path, *flags: str, sizes: tuple[str, ...] = SIZES) -> subprocess.CompletedProcess[str]:
@@ -41,23 +41,23 @@ def assert_curves_are_the_log(out: Path) -> dict[str, list[float]]:
     return logged
 
 
-def test_a_resume_in_stage_2_keeps_the_curves_of_stage_1(tmp_path: Path) -> None:
-    """Going on at step 5 of stage 2 dropped all that stage 1 had beyond its step 5, and the step that was saved last."""
+def test_a_resume_in_the_second_stage_keeps_the_curves_of_the_first(tmp_path: Path) -> None:
+    """Going on at step 5 of the second stage dropped all that the first had beyond its step 5, and the step that was saved last."""
     out = tmp_path / "run"
     for steps in (12, 23):
         assert train(out, "--stop-after-steps", str(steps)).returncode == 0
         assert_curves_are_the_log(out)
     assert train(out).returncode == 0
     logged = assert_curves_are_the_log(out)
-    assert (len(logged["stage1/elbo"]), len(logged["stage2/loss"])) == (30, 20)
+    assert (len(logged["identify/elbo"]), len(logged["denoise/loss"])) == (30, 20)
 
 
 def test_a_second_attempt_keeps_the_curves_of_the_first(tmp_path: Path) -> None:
-    """Stopped in the second attempt at stage 1 and continued, the first attempt's curves were cut at that step."""
+    """Stopped in the second attempt at a gate and continued, the first attempt's curves were cut at that step."""
     out = tmp_path / "run"
-    sizes = (*SIZES, "gate.filter=0.0", "gate.successor_state=0.0", "gate.tries=3")
+    sizes = (*SIZES, "stages.identify.gate.filter=0.0", "stages.identify.gate.successor_state=0.0", "stages.identify.gate.tries=3")
     assert train(out, "--stop-after-steps", "37", sizes=sizes).returncode == 0
     assert_curves_are_the_log(out)
     assert train(out, sizes=sizes).returncode == 1
     logged = assert_curves_are_the_log(out)
-    assert [len(logged[f"stage1{attempt}/elbo"]) for attempt in ("", ".attempt1", ".attempt2")] == [30, 30, 30]
+    assert [len(logged[f"identify{attempt}/elbo"]) for attempt in ("", ".attempt1", ".attempt2")] == [30, 30, 30]

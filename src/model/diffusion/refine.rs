@@ -1,4 +1,4 @@
-//! The loss of stage 2: denoise-and-refine, trained on exactly what the sampler has (section 4.3 of the paper, made safe).
+//! The loss of denoise-and-refine, trained on exactly what the sampler has (section 4.3 of the paper, made safe).
 //!
 //! The paper teacher-forces the latents of a window from its clean tokens. Read literally the latents then carry the window itself and
 //! the denoiser learns to copy it: measured on Cheetah-Wind-S, the error of held-out windows is .03 with training latents, 2.3 with the

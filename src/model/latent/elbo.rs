@@ -1,4 +1,4 @@
-//! The loss of stage 1: evidence lower bound over a block (equation of section 4.2; appendix A.4).
+//! Evidence lower bound over a block (equation of section 4.2; appendix A.4).
 
 use super::{Gaussian, LatentModel, Tokens};
 use crate::model::trajectory::Seen;
@@ -67,7 +67,7 @@ impl LatentModel {
         self.encoder.posterior(&after.reshape((batch, len - 1, ()))?)
     }
 
-    /// The negative ELBO of a batch. The prior of c_t sees the posterior of c_{t-1} with its gradient (stage 1 keeps it); the first position
+    /// The negative ELBO of a batch. The prior of c_t sees the posterior of c_{t-1} with its gradient; the first position
     /// has no predecessor in the block and only trains the decoder.
     ///
     /// State residuals are in units of the standard deviation of the state *change*: in units of the state the part that a hidden context

@@ -101,7 +101,7 @@ fn networks_against_pytorch() {
     golden.check_serving(|params| everything(&tokens_of::<Buffer>(|name| golden.value(&format!("in.{name}"))), params));
 }
 
-/// The loss of stage 1 and its gradients.
+/// The ELBO and its gradients.
 #[test]
 fn elbo_against_pytorch() {
     let options = ElboOptions { kl_weight: 0.3, state_change_std: vec![0.5, 1.0, 2.0], reward_weight: 0.7 };

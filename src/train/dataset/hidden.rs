@@ -6,7 +6,7 @@
 use crate::model::{config::Missing, noise::Philox, trajectory::Seen};
 use serde::{Deserialize, Serialize};
 
-/// The recipe's `[hide]`: how often a field of the history is hidden, in the blocks of stage 1 and the windows of stage 2.
+/// The recipe's `[hide]`: how often a field of the history is hidden, in the blocks of the ELBO and in windows.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Hide {

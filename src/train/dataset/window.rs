@@ -1,4 +1,4 @@
-//! Batches: blocks for stage 1 and windows for stage 2, cut from episodes at drawn places.
+//! Batches: blocks for the ELBO and windows to denoise, cut from episodes at drawn places.
 
 use super::{Episode, hidden::Hide};
 use crate::model::{
@@ -100,7 +100,7 @@ impl Places {
     }
 }
 
-/// What a batch of stage-1 blocks looks like.
+/// What a batch of blocks for the ELBO looks like.
 #[derive(Clone, Debug)]
 pub struct BlockShape {
     /// Blocks in a batch.
@@ -164,7 +164,7 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
     })
 }
 
-/// What a batch of stage-2 windows looks like.
+/// What a batch of windows to denoise looks like.
 #[derive(Clone, Debug)]
 pub struct WindowShape {
     /// Windows in a batch.

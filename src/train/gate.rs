@@ -1,0 +1,68 @@
+//! What the latent must have found before a run goes on.
+//!
+//! Now and then a run codes the state change instead of the context, or loses one axis of it (the ELBO is not
+//! identifying from every initialisation), so the probe decides whether it counts; if not, it starts anew from another seed.
+
+use super::{
+    Task,
+    probe::{Subjects, latent_probe, places, probed},
+    recipe::stages::Gate,
+    ridge::Table,
+};
+use crate::model::latent::{Evidence, LatentModel};
+use anyhow::{Result, anyhow};
+use serde::Serialize;
+
+/// Places of each side that the gate's probe uses.
+const ROWS: usize = 6000;
+
+/// What the gate saw.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Probed {
+    /// Standardised error without the successor.
+    pub filter: f64,
+    /// Standardised error with the successor's state; none of a belief that is held, for it does not wait for one.
+    pub successor_state: Option<f64>,
+}
+
+impl Probed {
+    /// Whether both errors are within the bounds.
+    pub fn passes(&self, gate: &Gate) -> bool {
+        self.filter <= gate.filter && self.successor_state.is_none_or(|error| error <= gate.successor_state)
+    }
+}
+
+/// Probes the latent model at the recipe's block length.
+///
+/// # Errors
+/// If the data have no context, or a tensor operation fails.
+pub fn probe(task: &Task, latent: &LatentModel) -> Result<Probed> {
+    let subjects = Subjects { train: &task.split.train, held_out: &task.split.held_out, rows_max: ROWS };
+    let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.looks(), &[0])?[0].error) };
+    let successor_state = probed(latent).contains(&Evidence::SuccessorState).then(|| error(Evidence::SuccessorState)).transpose()?;
+    Ok(Probed { filter: error(Evidence::Filter)?, successor_state })
+}
+
+/// Whether the contexts that the gate holds the latent against differ at all: an error in units of their variance needs one.
+///
+/// # Errors
+/// If rows are kept in a file and it cannot be read.
+pub fn contexts_vary(task: &Task) -> Result<bool> {
+    let episodes = &task.split.held_out;
+    let mut truth = Table::new(episodes.first().map_or(0, |episode| episode.context_dim));
+    for (episode, t) in places(episodes, ROWS).into_iter().filter(|(_, t)| *t >= task.config.method.latent.block_len()) {
+        truth.values.extend(episodes[episode].context(t)?.iter().map(|value| f64::from(*value)));
+    }
+    Ok(truth.varies())
+}
+
+/// What a user reads when no try has passed.
+pub fn failure(stage: &str, gate: &Gate, probes: &[serde_json::Value]) -> anyhow::Error {
+    anyhow!(
+        "stage {stage} did not pass its gate (filter {}, successor_state {}) in {} tries: {}; more data or steps, or a wider gate, may help",
+        gate.filter,
+        gate.successor_state,
+        gate.tries,
+        serde_json::Value::from(probes)
+    )
+}

@@ -1,0 +1,100 @@
+//! The ELBO on drawn blocks (section 4.2 of the paper).
+
+use super::{Job, Mean, Part};
+use crate::model::{
+    Networks,
+    latent::elbo::{ElboBatch, ElboOptions},
+    noise::Philox,
+};
+use crate::train::{
+    Task,
+    dataset::{
+        HELD_OUT_SEED,
+        window::{BlockShape, Places, blocks},
+    },
+    recipe::losses::{ElboConfig, Loss},
+};
+use anyhow::{Context, Result};
+use candle_core::Tensor;
+
+/// Blocks of the held-out loss.
+const HELD_OUT_BLOCKS: usize = 256;
+
+/// Draws blocks and evaluates the loss.
+pub struct ElboLoss<'a> {
+    task: &'a Task,
+    config: &'a ElboConfig,
+    /// In the sum that the stage minimizes.
+    weight: f64,
+    /// Steps on this loss in earlier stages: the warm-up of the KL weight goes on.
+    before: usize,
+    shape: BlockShape,
+    places: Places,
+}
+
+impl<'a> ElboLoss<'a> {
+    /// As the stage with this index has it; none where it does not.
+    pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
+        let (config, latent) = (task.recipe.losses.elbo.as_ref()?, task.config.method.latent.gru()?);
+        let (earlier, from) = task.recipe.stages.split_at(stage);
+        let weight = from.first().map(|stage| stage.weight(Loss::Elbo)).filter(|weight| *weight > 0.0)?;
+        let shape = BlockShape {
+            batch: config.batch,
+            len: latent.block_len() + 1 + config.length,
+            looks: latent.looks,
+            latent_dim: latent.dim,
+            show_action: config.show_action,
+            show_reward: config.show_reward,
+            hide: task.recipe.hide,
+        };
+        let before = earlier.iter().filter(|stage| stage.weight(Loss::Elbo) > 0.0).map(|stage| stage.steps).sum();
+        Some(Self { task, config, weight, before, places: shape.places(&task.split.train), shape })
+    }
+
+    /// Draws the batch of this step of the stage.
+    ///
+    /// # Errors
+    /// If an episode cannot be read.
+    pub(super) fn job<'b>(&'b self, networks: &'b Networks, step: usize, rng: &mut Philox) -> Result<Job<'b>> {
+        let batch = blocks(&self.task.split.train, &self.places, &self.shape, rng)?;
+        let kl_weight = self.config.kl_weight.at(self.before + step);
+        Ok(Box::new(move || {
+            let (loss, means) = self.evaluate(networks, &batch, kl_weight)?;
+            Ok(Part { grads: loss.affine(self.weight, 0.0)?.backward()?, means })
+        }))
+    }
+
+    /// The loss of a batch, and its parts.
+    fn evaluate(&self, networks: &Networks, batch: &ElboBatch, kl_weight: f64) -> Result<(Tensor, Vec<Mean>)> {
+        let options = ElboOptions {
+            kl_weight,
+            state_change_std: self.task.config.units.normalizer.state_change_std.clone(),
+            reward_weight: self.config.reward_weight,
+        };
+        let latent = networks.latent.as_ref().context("the ELBO needs a latent model: is a bug")?;
+        let terms = latent.elbo(batch, &options)?;
+        let mean = |name, tensor: &Tensor| -> Result<Mean> { Ok(Mean { name, sum: f64::from(tensor.to_scalar::<f32>()?), count: 1 }) };
+        let means = vec![
+            mean("elbo", &terms.loss)?,
+            mean("state_error", &terms.state_error)?,
+            mean("reward_error", &terms.reward_error)?,
+            mean("kl", &terms.kl)?,
+        ];
+        Ok((terms.loss, means))
+    }
+
+    /// The ELBO of held-out blocks, always the same ones, with the last weight of the KL; none where no held-out episode has room for one.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn held_out(&self, networks: &Networks) -> Result<Option<f64>> {
+        let (episodes, shape) = (&self.task.split.held_out, BlockShape { batch: HELD_OUT_BLOCKS, ..self.shape.clone() });
+        let places = shape.places(episodes);
+        if places.is_empty() {
+            return Ok(None);
+        }
+        let batch = blocks(episodes, &places, &shape, &mut Philox::new(HELD_OUT_SEED))?;
+        let (loss, _) = self.evaluate(networks, &batch, self.config.kl_weight.end)?;
+        Ok(Some(f64::from(loss.to_scalar::<f32>()?)))
+    }
+}

@@ -1,0 +1,112 @@
+//! A stage at work: the batches of its losses are drawn, their gradients computed side by side, and the optimizer makes one step on the
+//! weighted sum.
+
+pub mod denoise;
+pub mod elbo;
+
+use super::{
+    Task,
+    learner::{Learner, Scalars},
+    parallel::side_by_side,
+    recipe::stages::Stage,
+};
+use crate::model::{Networks, noise::Philox};
+use anyhow::Result;
+use candle_core::backprop::GradStore;
+use denoise::DenoiseLoss;
+use elbo::ElboLoss;
+
+/// A piece of a step's work, free to run on any thread.
+type Job<'a> = Box<dyn FnOnce() -> Result<Part> + Send + 'a>;
+
+/// What a job gives.
+struct Part {
+    /// Gradients of the weighted loss.
+    grads: GradStore,
+    /// For the log.
+    means: Vec<Mean>,
+}
+
+/// A number of the log, as a sum over `count` terms, so that the parts of a batch make one mean.
+struct Mean {
+    name: &'static str,
+    sum: f64,
+    count: usize,
+}
+
+/// The losses of a stage.
+pub struct Objective<'a> {
+    task: &'a Task,
+    stage: &'a Stage,
+    denoise: Option<DenoiseLoss<'a>>,
+    elbo: Option<ElboLoss<'a>>,
+}
+
+impl<'a> Objective<'a> {
+    /// Of the stage with this index.
+    pub fn new(task: &'a Task, stage: usize) -> Self {
+        let denoise = DenoiseLoss::of_stage(task, stage);
+        Self { task, stage: &task.recipe.stages[stage], denoise, elbo: ElboLoss::of_stage(task, stage) }
+    }
+
+    /// One optimizer step, and one of the average.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn step(&self, learner: &mut Learner) -> Result<Scalars> {
+        let step = learner.position.step;
+        let mut rng = learner.position.stream(self.task.recipe.seed);
+        let jobs = self.jobs(&learner.networks, step, &mut rng)?;
+        let parts = side_by_side(jobs).into_iter().collect::<Result<Vec<Part>>>()?;
+        let mut scalars = means(&parts);
+        let grads: Vec<GradStore> = parts.into_iter().map(|part| part.grads).collect();
+        let rate = self.stage.learning_rate.at(step, self.stage.steps);
+        let rates: Vec<f64> = self.stage.trains.values().map(|factor| rate * factor).collect();
+        let norm = learner.adam.step(&grads, &rates)?;
+        if let Some(ema) = learner.ema.as_mut().filter(|_| norm.is_finite()) {
+            ema.update(&learner.vars, step)?;
+        }
+        scalars.extend([("grad_norm", norm), ("learning_rate", rate)]);
+        Ok(scalars)
+    }
+
+    /// The work of a step; batches are drawn here, in the order of [`super::recipe::losses::Loss`].
+    fn jobs<'b>(&'b self, networks: &'b Networks, step: usize, rng: &mut Philox) -> Result<Vec<Job<'b>>> {
+        let mut jobs = Vec::new();
+        if let Some(denoise) = &self.denoise {
+            jobs.extend(denoise.jobs(networks, rng)?);
+        }
+        if let Some(elbo) = &self.elbo {
+            jobs.push(elbo.job(networks, step, rng)?);
+        }
+        Ok(jobs)
+    }
+
+    /// Losses on held-out episodes, for the log.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn held_out(&self, networks: &Networks) -> Result<Scalars> {
+        let mut scalars = Vec::new();
+        if let Some(denoise) = &self.denoise {
+            let errors = denoise.held_out_errors(networks)?;
+            scalars.push(("held_out_loss", errors.iter().sum::<f64>() / errors.len() as f64));
+        }
+        if let Some(loss) = self.elbo.as_ref().map(|elbo| elbo.held_out(networks)).transpose()?.flatten() {
+            scalars.push(("held_out_elbo", loss));
+        }
+        Ok(scalars)
+    }
+}
+
+/// One mean for each name, in the order in which the names first come; 0 where there was nothing to take it over.
+fn means(parts: &[Part]) -> Scalars {
+    let mut all: Vec<Mean> = Vec::new();
+    for Mean { name, sum, count } in parts.iter().flat_map(|part| &part.means) {
+        match all.iter_mut().find(|mean| mean.name == *name) {
+            Some(mean) => (mean.sum, mean.count) = (mean.sum + sum, mean.count + count),
+            None => all.push(Mean { name, sum: *sum, count: *count }),
+        }
+    }
+    all.into_iter().map(|mean| (mean.name, if mean.count == 0 { 0.0 } else { mean.sum / mean.count as f64 })).collect()
+}

@@ -1,0 +1,162 @@
+//! The losses that a stage may minimize, and what each of them needs to know; written once, whichever stages it is part of.
+
+use super::{
+    Recipe,
+    error::{RecipeError, WEIGHTS, between, require},
+};
+use crate::model::{
+    diffusion::refine::LatentRouting,
+    method::{Future, Schedule},
+};
+use serde::{Deserialize, Serialize};
+
+/// Rows of one batch.
+const BATCH_MAX: usize = 65_536;
+/// Steps of a block of the ELBO.
+const LENGTH_MAX: usize = 65_536;
+
+/// A loss by its name. The order is that in which a step draws their batches.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Loss {
+    /// [`DenoiseConfig`].
+    Denoise,
+    /// [`ElboConfig`].
+    Elbo,
+}
+
+impl Loss {
+    /// As recipes spell it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Denoise => "denoise",
+            Self::Elbo => "elbo",
+        }
+    }
+}
+
+/// The losses of a recipe.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Losses {
+    /// What cannot be seen; absent for models without latents.
+    pub elbo: Option<ElboConfig>,
+    /// Denoise and refine.
+    pub denoise: DenoiseConfig,
+}
+
+/// The evidence lower bound of what the latent explains (section 4.2 of the paper).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ElboConfig {
+    /// Blocks in a batch.
+    pub batch: usize,
+    /// Steps of a block beyond its first `block_len + 1` tokens; that of a GRU which runs on begins at an episode's start.
+    pub length: usize,
+    /// Weight of the KL term; its warm-up counts the steps of all stages that minimize the ELBO.
+    pub kl_weight: Ramp,
+    /// Weight of the reward against one state column.
+    pub reward_weight: f64,
+    /// Probability that the posterior sees the successor's action.
+    pub show_action: f32,
+    /// Probability that it sees the successor's reward, given the action.
+    pub show_reward: f32,
+}
+
+impl ElboConfig {
+    fn check(&self) -> Result<(), RecipeError> {
+        between("losses.elbo.batch", self.batch, 1..=BATCH_MAX)?;
+        between("losses.elbo.length", self.length, 2..=LENGTH_MAX)?;
+        between("losses.elbo.show_action", self.show_action, 0.0..=1.0)?;
+        between("losses.elbo.show_reward", self.show_reward, 0.0..=1.0)?;
+        between("losses.elbo.kl_weight.start", self.kl_weight.start, WEIGHTS)?;
+        between("losses.elbo.kl_weight.end", self.kl_weight.end, WEIGHTS)?;
+        between("losses.elbo.reward_weight", self.reward_weight, WEIGHTS)
+    }
+}
+
+/// A value that grows on a line and then stays.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Ramp {
+    /// At step 0.
+    pub start: f64,
+    /// From `steps` on.
+    pub end: f64,
+    /// Steps from start to end.
+    pub steps: usize,
+}
+
+impl Ramp {
+    /// The value at `step`.
+    pub fn at(&self, step: usize) -> f64 {
+        self.start + (self.end - self.start) * (step as f64 / self.steps.max(1) as f64).min(1.0)
+    }
+}
+
+/// The error of windows that are denoised, with latents as the sampler has them (section 4.3 of the paper).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DenoiseConfig {
+    /// Windows in a batch.
+    pub batch: usize,
+    /// Where the latents of a window come from.
+    pub routing: LatentRouting,
+    /// Which levels windows are shown at.
+    #[serde(default)]
+    pub levels: TrainingLevels,
+    /// Weight of the first action against one other entry of the window.
+    pub first_action_weight: f32,
+    /// Chunk lengths that a session may ask for (T_a), beside `sampler.action_horizon`.
+    #[serde(default)]
+    pub action_horizons: Vec<usize>,
+    /// Share of windows at READY rows, where latents are refined; the others are uniform over all rows.
+    pub ready_fraction: f32,
+}
+
+/// Levels of a training window.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TrainingLevels {
+    /// Those of the rows that the sampler walks.
+    #[default]
+    Schedule,
+    /// Of each position one of its own (diffusion forcing): every number of sub-steps is then trained, and no refinement.
+    Independent,
+}
+
+/// What the losses ask of themselves, of the model and of the stages.
+pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
+    let used = |loss: Loss| recipe.stages.iter().any(|stage| stage.weight(loss) > 0.0);
+    match (recipe.model.latent.gru(), &recipe.losses.elbo) {
+        (Some(_), Some(elbo)) => elbo.check()?,
+        (None, None) => {}
+        (Some(_), None) => require(false, "losses.elbo", "is missing, but model.latent asks for it")?,
+        (None, Some(_)) => require(false, "losses.elbo", "needs model.latent")?,
+    }
+    require(recipe.losses.elbo.is_none() || used(Loss::Elbo), "losses.elbo", "is minimized by no stage")?;
+    check_denoise(recipe)
+}
+
+fn check_denoise(recipe: &Recipe) -> Result<(), RecipeError> {
+    let loss = &recipe.losses.denoise;
+    between("losses.denoise.batch", loss.batch, 1..=BATCH_MAX)?;
+    between("losses.denoise.ready_fraction", loss.ready_fraction, 0.0..=1.0)?;
+    let weight = loss.first_action_weight;
+    let positive = weight.is_finite() && weight > 0.0;
+    require(positive, "losses.denoise.first_action_weight", format!("is {weight}, must be positive and finite"))?;
+    let horizon = recipe.model.plan.horizon;
+    let within = loss.action_horizons.iter().all(|chunk| (1..=horizon).contains(chunk));
+    require(within, "losses.denoise.action_horizons", format!("must lie in 1..={horizon} (model.plan.horizon)"))?;
+    let gaps = recipe.action_horizons().iter().all(|chunk| *chunk == 1) || recipe.hide.state > 0.0;
+    require(gaps, "hide.state", "must be above 0 where a chunk has several actions: its client may know no states in between")?;
+    let alone = recipe.action_horizons() == [1] || recipe.refines() || recipe.model.latent.gru().is_none();
+    let walks = recipe.model.plan.schedule == Schedule::Ladder;
+    let reason = "must be 1 alone, as `sampler.action_horizon`: without refinement the latent of a chunk's later actions would be that of its \
+                  first, which no window of training has";
+    require(alone || !walks, "losses.denoise.action_horizons", reason)?;
+    let held = recipe.model.latent.gru().is_some_and(|gru| gru.future == Future::Held);
+    let literal = loss.routing == LatentRouting::Literal;
+    let reason = "cannot be literal where model.latent.future is held: a held belief has no posterior";
+    require(!(held && literal), "losses.denoise.routing", reason)
+}

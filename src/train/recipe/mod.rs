@@ -1,0 +1,191 @@
+//! A recipe: everything a training run depends on beside the data; typed, checked once, stored in the checkpoint.
+
+pub mod error;
+pub mod keys;
+pub mod losses;
+pub mod stages;
+
+use super::dataset::{hidden::Hide, units::ActionsConfig};
+use crate::model::{
+    checkpoint::{NAME_LEN_MAX, is_name},
+    config::{Defaults, ModelConfig, Restart, Trained, Units},
+    diffusion::refine::LatentRouting,
+    method::{Method, Schedule},
+    options::SamplerOptions,
+    trajectory::Layout,
+};
+use error::require;
+use losses::{Losses, TrainingLevels};
+use serde::{Deserialize, Serialize};
+use stages::{Gate, Stage};
+use std::{
+    collections::BTreeSet,
+    path::{Path, PathBuf},
+};
+
+pub use error::RecipeError;
+
+/// A training run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Name of the model.
+    pub name: String,
+    /// Training seed: initial weights and batches.
+    pub seed: u64,
+    /// HDF5 file in D4RL's layout (docs/data.md), relative to the working directory.
+    pub data: PathBuf,
+    /// Steps between two checkpoints.
+    pub checkpoint_every: usize,
+    /// Steps between two lines of the log.
+    pub log_every: usize,
+    /// Units and bounds of actions.
+    #[serde(default)]
+    pub actions: ActionsConfig,
+    /// What is hidden of histories, so that acts may come without it.
+    #[serde(default)]
+    pub hide: Hide,
+    /// What is built, and how it acts.
+    pub model: Method,
+    /// What is minimized, and on which batches.
+    pub losses: Losses,
+    /// By which steps, in order.
+    pub stages: Vec<Stage>,
+    /// Sampling defaults that go into the checkpoint.
+    pub sampler: SamplerOptions,
+    /// When a streaming window is not trusted any more; goes into the checkpoint.
+    #[serde(default)]
+    pub restart: Restart,
+}
+
+/// Sub-steps per rung that a checkpoint lists as trained where every level is.
+const SUB_STEPS_LISTED: usize = 64;
+
+impl Recipe {
+    /// Reads a recipe, applies overrides (`stages.denoise.steps=100`) and the path of another data set, and checks it.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or a key is unknown, missing, or its value makes no sense.
+    pub fn read(path: &Path, overrides: &[String], data: Option<&Path>) -> Result<Self, RecipeError> {
+        let text = std::fs::read_to_string(path).map_err(|error| RecipeError::Io { path: path.into(), reason: error.to_string() })?;
+        let syntax = |error: toml::de::Error| RecipeError::Syntax { path: path.into(), reason: error.to_string() };
+        let mut recipe: Self = if overrides.is_empty() && data.is_none() {
+            toml::from_str(&text).map_err(syntax)?
+        } else {
+            let mut table: toml::Table = toml::from_str(&text).map_err(syntax)?;
+            overrides.iter().try_for_each(|text| keys::set(&mut table, text))?;
+            if data.is_some() {
+                // The path itself is set below: not every path can be a TOML string. The key need not be in the file.
+                table.insert("data".into(), toml::Value::String(String::new()));
+            }
+            table.try_into().map_err(syntax)?
+        };
+        if let Some(data) = data {
+            recipe.data = data.into();
+        }
+        recipe.check()?;
+        Ok(recipe)
+    }
+
+    /// Seed of the weights of one attempt to pass a gate.
+    pub fn seed_of(&self, attempt: usize) -> u64 {
+        self.seed + 1000 * attempt as u64
+    }
+
+    /// The recipe as TOML, as it goes into the manifest: overrides included, of the data set's path only the name (where it is not Unicode,
+    /// what can be shown of it).
+    pub fn to_toml(&self) -> String {
+        let data = self.data.file_name().unwrap_or(self.data.as_os_str()).to_string_lossy().into_owned().into();
+        let mut table = toml::Table::try_from(Self { data, ..self.clone() }).expect("a recipe came from TOML: is a bug");
+        // Infinity is serialised as null, which JSON needs and TOML leaves out.
+        let Restart { renoise_distance, cold_distance, latent_jump } = self.restart;
+        for (section, key, value) in [
+            ("sampler", "kappa", self.sampler.kappa),
+            ("restart", "renoise_distance", renoise_distance),
+            ("restart", "cold_distance", cold_distance),
+            ("restart", "latent_jump", latent_jump),
+        ] {
+            if let (true, Some(section)) = (value.is_infinite(), table.get_mut(section).and_then(toml::Value::as_table_mut)) {
+                section.insert(key.into(), toml::Value::Float(f64::INFINITY));
+            }
+        }
+        toml::to_string(&table).expect("a table is TOML: is a bug")
+    }
+
+    /// Chunk lengths to train, ascending: those of the loss and the default.
+    pub fn action_horizons(&self) -> Vec<usize> {
+        let all: BTreeSet<usize> = self.losses.denoise.action_horizons.iter().copied().chain([self.sampler.action_horizon]).collect();
+        all.into_iter().collect()
+    }
+
+    /// What this recipe ships, with plain units in place of what only data and training tell.
+    pub fn config(&self, layout: Layout) -> ModelConfig {
+        ModelConfig {
+            layout,
+            method: self.model.clone(),
+            units: Units::plain(layout),
+            trained: Trained {
+                action_horizons: self.action_horizons(),
+                sub_steps: self.sub_steps(),
+                missing: self.hide.trained(),
+                refined: self.refines(),
+            },
+            defaults: Defaults { sampler: self.sampler.clone(), restart: self.restart },
+        }
+    }
+
+    /// Sub-steps whose levels are trained, ascending.
+    fn sub_steps(&self) -> Vec<usize> {
+        let most = self.model.plan.level_max / self.model.plan.horizon.max(1);
+        match (self.losses.denoise.levels, self.model.plan.schedule) {
+            (TrainingLevels::Independent, Schedule::Ladder) => (1..=most.min(SUB_STEPS_LISTED)).collect(),
+            (TrainingLevels::Independent, Schedule::Uniform { .. }) | (TrainingLevels::Schedule, _) => vec![self.sampler.sub_steps],
+        }
+    }
+
+    /// Whether latents are refined in training as zig-zag does it.
+    fn refines(&self) -> bool {
+        let loss = &self.losses.denoise;
+        self.model.can_refine() && loss.routing == LatentRouting::Matched && loss.levels == TrainingLevels::Schedule
+    }
+
+    /// The gate of this run, wherever it stands.
+    pub fn gate(&self) -> Option<&Gate> {
+        self.stages.iter().find_map(|stage| stage.gate.as_ref())
+    }
+
+    /// Steps an episode must have, and the keys that ask for them.
+    pub fn episode_len_min(&self) -> (usize, String) {
+        let window = (self.model.plan.horizon, "`model.plan.horizon`".to_string());
+        let block = self.losses.elbo.as_ref().map(|elbo| (elbo.length + 1, "`losses.elbo.length` + 1".to_string()));
+        block.into_iter().fold(window, |most, other| if other.0 > most.0 { other } else { most })
+    }
+
+    /// What is shipped must be a model that loads ([`ModelConfig::check`]); the rest is training's own.
+    fn check(&self) -> Result<(), RecipeError> {
+        self.config(Layout { state_dim: 1, action_dim: 1 }).check().map_err(|unfit| {
+            // The recipe's own sections for the same things.
+            let key = match unfit.field.split_once('.') {
+                Some(("defaults", field)) => field.into(),
+                Some(("method", field)) => format!("model.{field}"),
+                _ => unfit.field,
+            };
+            RecipeError::Invalid { key, reason: unfit.reason }
+        })?;
+        let room = NAME_LEN_MAX.saturating_sub(format!("-seed{}", self.seed).len());
+        let named = is_name(&self.name) && self.name.len() <= room;
+        require(named, "name", format!("{:?} must be 1 to {room} of A-Z a-z 0-9 _ . -, as the server serves it by this name", self.name))?;
+        require(self.model.plan.horizon >= 2, "model.plan.horizon", "must be at least 2")?;
+        for (key, value) in [("checkpoint_every", self.checkpoint_every), ("log_every", self.log_every)] {
+            require(value >= 1, key, "must be at least 1")?;
+        }
+        for (key, bounds) in [("actions.low", &self.actions.low), ("actions.high", &self.actions.high)] {
+            require(bounds.iter().all(|bound| bound.is_finite()), key, "must be finite numbers; leave it out to take the data's")?;
+        }
+        for (key, share) in [("hide.state", self.hide.state), ("hide.action", self.hide.action), ("hide.reward", self.hide.reward)] {
+            require((0.0..=1.0).contains(&share), key, "must lie in 0..=1")?;
+        }
+        stages::check(self)?;
+        losses::check(self)
+    }
+}

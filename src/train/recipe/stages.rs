@@ -1,0 +1,144 @@
+//! Stages are data: what is minimized, which networks move, how fast and for how long.
+
+use super::{
+    Recipe,
+    error::{RecipeError, WEIGHTS, between, require},
+    losses::Loss,
+};
+use crate::train::optimizer::LearningRate;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Networks that are trained together, by the field of [`crate::model::Networks`] that holds them; their variables' names begin with it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Group {
+    /// Encoder, prior and decoders of what cannot be seen.
+    Latent,
+    /// The planner.
+    Denoiser,
+}
+
+impl Group {
+    /// All of them.
+    pub const ALL: [Self; 2] = [Self::Latent, Self::Denoiser];
+
+    /// As recipes and checkpoints spell it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Latent => "latent",
+            Self::Denoiser => "denoiser",
+        }
+    }
+
+    /// The group of a variable.
+    pub fn of(variable: &str) -> Option<Self> {
+        let (first, _) = variable.split_once('.')?;
+        Self::ALL.into_iter().find(|group| group.name() == first)
+    }
+
+    /// Whether the gradient of a loss comes to it.
+    fn is_reached_by(self, loss: Loss) -> bool {
+        match (self, loss) {
+            (Self::Latent, Loss::Elbo | Loss::Denoise) | (Self::Denoiser, Loss::Denoise) => true,
+            (Self::Denoiser, Loss::Elbo) => false,
+        }
+    }
+}
+
+/// Steps of the optimizer on a sum of losses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stage {
+    /// How logs and `--set` call it.
+    pub name: String,
+    /// Optimizer steps.
+    pub steps: usize,
+    /// The losses, each with its weight; 0 is off.
+    pub minimizes: BTreeMap<Loss, f64>,
+    /// The networks that move, each with a factor on the learning rate.
+    pub trains: BTreeMap<Group, f64>,
+    /// As a function of the step of this stage.
+    pub learning_rate: LearningRate,
+    /// Decoupled weight decay.
+    pub weight_decay: f64,
+    /// Largest decay of the average of the weights, which is what a checkpoint holds; absent: no average.
+    pub ema_decay_max: Option<f64>,
+    /// What must be reached before the next stage.
+    pub gate: Option<Gate>,
+}
+
+impl Stage {
+    /// Weight of a loss, 0 for those that are not minimized.
+    pub fn weight(&self, loss: Loss) -> f64 {
+        self.minimizes.get(&loss).copied().unwrap_or(0.0)
+    }
+
+    /// Whether the latent alone is looked for; then a probe tells what was found.
+    pub fn identifies(&self) -> bool {
+        self.weight(Loss::Elbo) > 0.0 && self.weight(Loss::Denoise) == 0.0
+    }
+
+    fn check(&self, recipe: &Recipe) -> Result<(), RecipeError> {
+        let key = |field: &str| format!("stages.{}.{field}", self.name);
+        for (loss, weight) in &self.minimizes {
+            between(key(&format!("minimizes.{}", loss.name())), *weight, WEIGHTS)?;
+            let there = *weight == 0.0 || *loss != Loss::Elbo || recipe.losses.elbo.is_some();
+            require(there, key("minimizes.elbo"), "needs [losses.elbo]")?;
+        }
+        for (group, factor) in &self.trains {
+            let key = key(&format!("trains.{}", group.name()));
+            between(&key, *factor, WEIGHTS)?;
+            require(*group != Group::Latent || recipe.model.latent.gru().is_some(), &key, "needs model.latent")?;
+            let reached = self.minimizes.iter().any(|(loss, weight)| *weight > 0.0 && group.is_reached_by(*loss));
+            require(reached, &key, "is not reached by any loss that this stage minimizes")?;
+        }
+        require(!self.trains.is_empty(), key("trains"), "names no network, so nothing would be learned")?;
+        between(key("weight_decay"), self.weight_decay, WEIGHTS)?;
+        let rate = &self.learning_rate;
+        require(rate.peak.is_finite() && rate.peak > 0.0, key("learning_rate.peak"), "must be positive and finite")?;
+        require(rate.end >= 0.0 && rate.end <= rate.peak, key("learning_rate.end"), "must lie between 0 and the peak")?;
+        require(self.ema_decay_max.is_none_or(|decay| (0.0..1.0).contains(&decay)), key("ema_decay_max"), "must lie in 0..1")?;
+        let Some(gate) = &self.gate else { return Ok(()) };
+        require(self.identifies(), key("gate"), "asks for a stage that minimizes the elbo alone")?;
+        gate.check(&self.name)
+    }
+}
+
+/// Bounds on the linear probe after a stage (standardised mean squared error on held-out episodes); needs `infos/context` in the data.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Gate {
+    /// Largest error from history and the current state alone.
+    pub filter: f64,
+    /// Largest error with the successor state.
+    pub successor_state: f64,
+    /// How often it is tried, each time from the first stage and another seed.
+    pub tries: usize,
+}
+
+impl Gate {
+    fn check(&self, stage: &str) -> Result<(), RecipeError> {
+        for (field, value) in [("filter", self.filter), ("successor_state", self.successor_state)] {
+            require(value >= 0.0, format!("stages.{stage}.gate.{field}"), format!("is {value}, must be 0 or above"))?;
+        }
+        require(self.tries >= 1, format!("stages.{stage}.gate.tries"), "must be at least 1")
+    }
+}
+
+/// Each stage for itself, and that the last one makes what is shipped.
+pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
+    let last = recipe.stages.last();
+    let mut names = BTreeSet::new();
+    for stage in &recipe.stages {
+        let legal = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+        let named = (1..=32).contains(&stage.name.len()) && stage.name.chars().all(legal);
+        require(named, "stages.name", format!("{:?} must be 1 to 32 of a-z 0-9 _", stage.name))?;
+        require(names.insert(&stage.name), "stages.name", format!("{:?} is there twice", stage.name))?;
+        stage.check(recipe)?;
+    }
+    let Some(last) = last else { return require(false, "stages", "are missing: at least one must minimize denoise") };
+    let key = |field: &str| format!("stages.{}.{field}", last.name);
+    require(last.weight(Loss::Denoise) > 0.0, key("minimizes.denoise"), "must be above 0 in the last stage, whose weights are shipped")?;
+    require(last.gate.is_none(), key("gate"), "opens the way to another stage, and this is the last")
+}
