@@ -1,9 +1,10 @@
 //! What stands for a part that is not there.
 
 use super::{
-    layer::{Layer, Weight},
+    layer::Layer,
     op::Op,
     params::{Init, Params},
+    weights::Weight,
 };
 use candle_core::Result;
 

@@ -1,11 +1,11 @@
 //! Convolution over time and its transpose, channels last, with PyTorch's weights (`nn.Conv1d`, `nn.ConvTranspose1d`).
 
 use super::{
-    kernels::{convolution::Convolution, join},
-    layer::{Layer, Weight, WeightRef, WeightsRef},
-    op::{Op, Past, Slot, View, fill},
+    layer::Layer,
+    op::{Conv, Op},
     params::{Init, Params},
     value::Value,
+    weights::Weight,
 };
 use candle_core::{Result, Tensor};
 
@@ -24,7 +24,7 @@ impl Conv1d {
         let init = Init::FanIn(shape.c_in * shape.kernel);
         let weight = p.get((shape.c_out, shape.c_in, shape.kernel), "weight", init)?;
         let bias = p.get(shape.c_out, "bias", init)?;
-        Conv { shape, transposed: false }.layer(weight, bias, p).map(Self)
+        layer(Conv { shape, transposed: false }, weight, bias, p).map(Self)
     }
 
     /// `(B, T, c_in)` to `(B, T', c_out)`.
@@ -51,7 +51,7 @@ impl ConvTranspose1d {
         let bias = p.get(shape.c_out, "bias", init)?;
         // The transpose of a convolution from `c_in` to `c_out` is the transposed map of a convolution from `c_out` to `c_in`.
         let shape = ConvShape { c_in: shape.c_out, c_out: shape.c_in, ..shape };
-        Conv { shape, transposed: true }.layer(weight, bias, p).map(Self)
+        layer(Conv { shape, transposed: true }, weight, bias, p).map(Self)
     }
 
     /// `(B, T, c_in)` to `(B, T', c_out)`.
@@ -63,78 +63,11 @@ impl ConvTranspose1d {
     }
 }
 
-/// A convolution, its transpose, or a linear layer; one shape with a direction describes them all.
-#[derive(Clone, Copy, Debug)]
-pub struct Conv {
-    shape: ConvShape,
-    transposed: bool,
-}
-
-impl Conv {
-    /// A layer without a kernel over time.
-    pub(super) fn linear(c_in: usize, c_out: usize) -> Self {
-        Self { shape: ConvShape { c_in, c_out, kernel: 1, stride: 1, padding: 0 }, transposed: false }
-    }
-
-    pub(super) fn layer(self, weight: Tensor, bias: Tensor, p: &Params) -> Result<Layer> {
-        let Self { shape, transposed } = self;
-        let pack = |weight: &[f32]| {
-            if transposed { Weight::Phases(shape.pack_spread(weight)) } else { Weight::Packed(shape.pack_gather(weight)) }
-        };
-        Layer::new(Op::Conv(self), weight, Some(bias), p, pack)
-    }
-
-    /// Shape of the result on `x` `[batch, steps, channels]`.
-    pub(super) fn shape(self, x: [usize; 3]) -> Result<[usize; 3]> {
-        let ConvShape { c_in, c_out, kernel, stride, padding } = self.shape;
-        let ([batch, steps, channels], [from, to]) = (x, if self.transposed { [c_out, c_in] } else { [c_in, c_out] });
-        if channels != from {
-            candle_core::bail!("a layer of {from} input channels got {channels}");
-        }
-        let result = if self.shape.is_pointwise() {
-            Some(steps)
-        } else if self.transposed {
-            (steps.max(1) * stride + kernel).checked_sub(stride + 2 * padding).filter(|&steps| steps > 0)
-        } else {
-            (steps + 2 * padding).checked_sub(kernel).map(|span| span / stride + 1)
-        };
-        let Some(result) = result else { candle_core::bail!("{steps} steps are too few for {:?}", self.shape) };
-        Ok([batch, result, to])
-    }
-
-    /// The work on `x`. Without a kernel over time all rows are one window.
-    fn work(self, x: [usize; 3]) -> Result<Convolution> {
-        let ([batch, steps, _], [_, result, _]) = (x, self.shape(x)?);
-        if self.shape.is_pointwise() {
-            return Ok(Convolution { shape: self.shape, batch: 1, wide_steps: batch * steps, narrow_steps: batch * steps });
-        }
-        let (wide_steps, narrow_steps) = if self.transposed { (result, steps) } else { (steps, result) };
-        Ok(Convolution { shape: self.shape, batch, wide_steps, narrow_steps })
-    }
-
-    pub(super) fn forward(self, x: View, WeightsRef { weight, bias }: WeightsRef, out: &mut [f32]) -> Result<()> {
-        let work = self.work(x.shape)?;
-        match weight {
-            WeightRef::Packed(packed) => work.gather(x.values, packed, Some(bias), out),
-            WeightRef::Phases(phases) => work.spread(x.values, phases, Some(bias), out),
-            WeightRef::Plain(weight) if self.transposed => work.spread(x.values, &work.spread_weights(weight), Some(bias), out),
-            WeightRef::Plain(weight) => work.gather(x.values, &work.gather_weights(weight), Some(bias), out),
-        }
-        Ok(())
-    }
-
-    pub(super) fn backward(self, past: &Past, to: &mut [Slot]) -> Result<()> {
-        let (x, dy, work) = (past.inputs[0].values, past.grad, self.work(past.inputs[0].shape)?);
-        if let Some(dx) = &mut to[0] {
-            let weight = past.weights.plain()?;
-            if self.transposed {
-                work.gather(dy, &work.gather_weights(weight), None, dx);
-            } else {
-                work.spread(dy, &work.spread_weights(weight), None, dx);
-            }
-        }
-        fill(&mut to[1], |dw| if self.transposed { work.weight_grad(dy, x, dw) } else { work.weight_grad(x, dy, dw) });
-        fill(&mut to[2], |db| join::add_rows(dy, db.len(), db));
-        Ok(())
-    }
+/// A layer of this convolution, packed if its weights are constant.
+pub(super) fn layer(conv: Conv, weight: Tensor, bias: Tensor, p: &Params) -> Result<Layer> {
+    let pack = |weight: &[f32]| match conv.transposed {
+        true => Weight::Phases(conv.shape.pack_spread(weight)),
+        false => Weight::Packed(conv.shape.pack_gather(weight)),
+    };
+    Layer::new(Op::Conv(conv), weight, Some(bias), p, pack)
 }

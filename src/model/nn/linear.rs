@@ -1,8 +1,9 @@
 //! The fully connected layer, PyTorch's `nn.Linear`.
 
 use super::{
-    conv1d::Conv,
+    conv1d::layer,
     layer::Layer,
+    op::Conv,
     params::{Init, Params},
     value::Value,
 };
@@ -27,7 +28,7 @@ impl Linear {
     /// Those of [`Params::get`].
     pub fn with_init(d_in: usize, d_out: usize, weight: Init, bias: Init, p: &Params) -> Result<Self> {
         let (weight, bias) = (p.get((d_out, d_in), "weight", weight)?, p.get(d_out, "bias", bias)?);
-        Conv::linear(d_in, d_out).layer(weight, bias, p).map(Self)
+        layer(Conv::linear(d_in, d_out), weight, bias, p).map(Self)
     }
 
     /// A layer that is used in parts: one parameter pair, `weight` `(sum of widths, d_in)` and its `bias`, as one layer for each width.
@@ -41,7 +42,7 @@ impl Linear {
         for (i, width) in widths.into_iter().enumerate() {
             let start = widths[..i].iter().sum();
             let (weight, bias) = (weight.narrow(0, start, width)?, bias.narrow(0, start, width)?);
-            layers.push(Self(Conv::linear(d_in, width).layer(weight, bias, p)?));
+            layers.push(Self(layer(Conv::linear(d_in, width), weight, bias, p)?));
         }
         layers.try_into().map_err(|_| candle_core::Error::Msg("as many layers as widths: is a bug".into()))
     }

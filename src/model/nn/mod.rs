@@ -11,6 +11,7 @@ mod buffer;
 #[cfg(test)]
 mod candle_faults;
 pub mod conv1d;
+mod difference;
 pub mod gru;
 pub mod host;
 pub mod kernels;
@@ -26,18 +27,21 @@ mod testing;
 mod tests;
 pub mod time_embedding;
 mod value;
+mod weights;
 
 pub use absent::Absent;
 pub use buffer::Buffer;
 pub use conv1d::{Conv1d, ConvShape, ConvTranspose1d};
+pub use difference::Difference;
 pub use gru::Gru;
 pub use kernels::{activation::Activation, product::Precision};
-pub use layer::{Layer, WeightRef, WeightsRef};
+pub use layer::Layer;
 pub use linear::Linear;
 pub use norm::{GroupNormMish, LayerNorm};
 pub use op::{Form, Op, Past, Slot, View};
 pub use params::{Init, Params};
 pub use value::Value;
+pub use weights::{WeightRef, WeightsRef};
 
 /// What candle says of an error, without the backtrace that it adds where `RUST_BACKTRACE` is set: that is for a debugger, not for a user.
 pub fn plain(error: &candle_core::Error) -> String {

@@ -1,14 +1,11 @@
 //! Group norm with Mish (one operation, as the U-Net always has them in a row) and layer norm.
 
 use super::{
-    kernels::{
-        norm::{self, Norm, NormGrads},
-        pool::Pooled,
-    },
-    layer::{Layer, Weight, WeightsRef},
-    op::{Op, Past, Slot},
+    layer::Layer,
+    op::{NormKind, Op},
     params::{Init, Params},
     value::Value,
+    weights::Weight,
 };
 use candle_core::{Device, Result, Tensor, bail};
 
@@ -26,7 +23,7 @@ impl GroupNormMish {
             bail!("{groups} groups do not divide {channels} channels");
         }
         let (weight, bias) = (p.get(channels, "weight", Init::Const(1.0))?, p.get(channels, "bias", Init::Const(0.0))?);
-        NormKind { channels, groups, eps: 1e-5, over_time: true, mish: true }.layer(weight, bias, p).map(Self)
+        layer(NormKind { channels, groups, eps: 1e-5, over_time: true, mish: true }, weight, bias, p).map(Self)
     }
 
     /// `(B, T, C)` to the same shape; statistics of an item run over the channels of a group and over time.
@@ -54,7 +51,7 @@ impl LayerNorm {
         } else {
             (Tensor::from_vec(vec![1.0_f32; dim], dim, &Device::Cpu)?, Tensor::from_vec(vec![0.0_f32; dim], dim, &Device::Cpu)?)
         };
-        NormKind { channels: dim, groups: 1, eps: eps as f32, over_time: false, mish: false }.layer(weight, bias, p).map(Self)
+        layer(NormKind { channels: dim, groups: 1, eps: eps as f32, over_time: false, mish: false }, weight, bias, p).map(Self)
     }
 
     /// `(B, T, dim)` to the same shape.
@@ -66,39 +63,6 @@ impl LayerNorm {
     }
 }
 
-/// A normalisation of windows of any length.
-#[derive(Clone, Copy, Debug)]
-pub struct NormKind {
-    /// Channels of a step.
-    pub(super) channels: usize,
-    groups: usize,
-    eps: f32,
-    /// Whether statistics run over all steps of an item, or each step has its own.
-    over_time: bool,
-    mish: bool,
-}
-
-impl NormKind {
-    fn layer(self, weight: Tensor, bias: Tensor, p: &Params) -> Result<Layer> {
-        Layer::new(Op::Norm(self), weight, Some(bias), p, |weight| Weight::Plain(weight.to_vec()))
-    }
-
-    fn at(self, steps: usize) -> Norm {
-        let Self { channels, groups, eps, over_time, mish } = self;
-        Norm { steps: if over_time { steps } else { 1 }, channels, groups, eps, mish }
-    }
-
-    pub(super) fn forward(self, steps: usize, weights: WeightsRef, x: &mut [f32]) -> Result<()> {
-        norm::in_place(self.at(steps), x, weights.plain()?, weights.bias);
-        Ok(())
-    }
-
-    pub(super) fn backward(self, past: &Past, to: &mut [Slot]) -> Result<()> {
-        let ([x], [dx, weight, bias]) = (past.inputs, to) else { bail!("a norm has one input and two parameters") };
-        // The gradient to `x` is on the way to the others, whether anybody wants it or not.
-        let mut spare = Pooled::copy_of(if dx.is_some() { &[] } else { past.grad });
-        let grads = NormGrads { x: dx.as_deref_mut().unwrap_or(&mut spare), weight: weight.as_deref_mut(), bias: bias.as_deref_mut() };
-        norm::backward(self.at(x.shape[1]), x.values, (past.weights.plain()?, past.weights.bias), grads);
-        Ok(())
-    }
+fn layer(kind: NormKind, weight: Tensor, bias: Tensor, p: &Params) -> Result<Layer> {
+    Layer::new(Op::Norm(kind), weight, Some(bias), p, |weight| Weight::Plain(weight.to_vec()))
 }

@@ -2,9 +2,10 @@
 
 use super::{
     host::{output, slice, values},
-    layer::{Constants, Layer, WeightRef, Weights, WeightsRef},
+    layer::Layer,
     op::{Form, Op, Past, Slot, View},
     value::Value,
+    weights::{Constants, WeightRef, Weights, WeightsRef},
 };
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, CustomOp3, Device, Layout, Result, Shape, Tensor, bail};
 use std::{ops::Deref, sync::Arc};

@@ -3,7 +3,7 @@
 //! Training runs it on candle's tensors, which record the way back; inference on [`super::Buffer`]s, plain numbers in pooled memory. Both go
 //! through the same operations ([`Op`]) and give the same bits.
 
-use super::{Absent, kernels::activation::Activation, layer::Layer, op::Op};
+use super::{Absent, Difference, kernels::activation::Activation, layer::Layer, op::Op};
 use candle_core::{Result, bail};
 
 /// Activations `(batch, steps, channels)`. Every operation is an error where shapes do not fit each other.
@@ -105,6 +105,14 @@ pub trait Value: Clone {
     /// If there are not so many.
     fn step(&self, index: usize) -> Result<Self> {
         self.run(&Layer::plain(Op::Step(index)), &[])
+    }
+
+    /// `(self - expected) scale`, column by column.
+    ///
+    /// # Errors
+    /// If shapes differ.
+    fn difference(self, expected: &Self, of: &Difference) -> Result<Self> {
+        self.run_in_place(&of.0, &[expected])
     }
 
     /// Rows where `present` (`(batch, steps, 1)`) is 1, the learned vector where it is 0.

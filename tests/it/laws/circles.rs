@@ -7,30 +7,7 @@ use super::{
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Imports on a circle, (file, file that it names): each to be undone. A module and those right below it may name each other.
-const KNOWN: &[(&str, &str)] = &[
-    ("model/nn/absent.rs", "model/nn/layer.rs"),
-    ("model/nn/absent.rs", "model/nn/op.rs"),
-    ("model/nn/conv1d.rs", "model/nn/layer.rs"),
-    ("model/nn/conv1d.rs", "model/nn/op.rs"),
-    ("model/nn/conv1d.rs", "model/nn/value.rs"),
-    ("model/nn/gru.rs", "model/nn/conv1d.rs"),
-    ("model/nn/gru.rs", "model/nn/layer.rs"),
-    ("model/nn/gru.rs", "model/nn/op.rs"),
-    ("model/nn/gru.rs", "model/nn/value.rs"),
-    ("model/nn/kernels/pool.rs", "model/nn/kernels/product/packed.rs"),
-    ("model/nn/kernels/product/packed.rs", "model/nn/kernels/pool.rs"),
-    ("model/nn/layer.rs", "model/nn/op.rs"),
-    ("model/nn/norm.rs", "model/nn/layer.rs"),
-    ("model/nn/norm.rs", "model/nn/op.rs"),
-    ("model/nn/norm.rs", "model/nn/value.rs"),
-    ("model/nn/op.rs", "model/nn/conv1d.rs"),
-    ("model/nn/op.rs", "model/nn/gru.rs"),
-    ("model/nn/op.rs", "model/nn/layer.rs"),
-    ("model/nn/op.rs", "model/nn/norm.rs"),
-    ("model/nn/value.rs", "model/nn/absent.rs"),
-    ("model/nn/value.rs", "model/nn/layer.rs"),
-    ("model/nn/value.rs", "model/nn/op.rs"),
-];
+const KNOWN: &[(&str, &str)] = &[];
 
 /// Imports, tests' aside, from and to which there is a way back, between files that are not parent and child.
 pub fn circles(sources: &Sources) -> BTreeSet<(String, String)> {

@@ -9,6 +9,7 @@ pub mod attention;
 pub mod convolution;
 pub mod gru;
 pub mod join;
+mod lane;
 pub mod math;
 pub mod norm;
 pub mod optimizer;

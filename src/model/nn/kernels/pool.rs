@@ -1,6 +1,6 @@
 //! Memory for activations and scratch: buffers of this thread that are used again and again, so that steady work allocates nothing.
 
-use super::product::{LANE, Lane, flat, flat_mut};
+use super::lane::{LANE, Lane, flat, flat_mut};
 use std::{
     cell::RefCell,
     ops::{Deref, DerefMut},

@@ -13,14 +13,11 @@ mod packed;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
-use super::{Isa, isa};
-pub(super) use packed::{Lane, flat, flat_mut};
+use super::{Isa, isa, lane::LANE};
 use packed::{Lanes, Stored, panel_width};
 pub use packed::{Packed, Passes, Precision};
 use std::ops::Range;
 
-/// Columns of one lane.
-pub(super) const LANE: usize = 16;
 /// Lanes of a full panel.
 const PANEL: usize = 4;
 /// Rows of a full tile.

@@ -1,7 +1,8 @@
 //! The right-hand side of a product: weights in panels of 64 columns, as f32 or bfloat16.
 
-use super::{LANE, PANEL, Terms};
+use super::{PANEL, Terms};
 use crate::model::nn::kernels::{
+    lane::{LANE, Lane, flat_mut},
     pool::Pooled,
     transpose::{self, transpose},
 };
@@ -16,23 +17,6 @@ pub enum Precision {
     F32,
     /// Rounded to bfloat16 (nearest, ties to even): half the memory, for weights that do not fit the cache.
     Bf16,
-}
-
-/// Sixteen columns of one `k`, on their own cache line.
-#[derive(Clone, Copy, Debug, Default)]
-#[repr(C, align(64))]
-pub(in crate::model::nn::kernels) struct Lane([f32; LANE]);
-
-/// The numbers of lanes, one after the other.
-pub(in crate::model::nn::kernels) fn flat(lanes: &[Lane]) -> &[f32] {
-    // SAFETY: a lane is 16 f32 without a gap, and its alignment is a multiple of theirs.
-    unsafe { std::slice::from_raw_parts(lanes.as_ptr().cast(), lanes.len() * LANE) }
-}
-
-/// See [`flat`].
-pub(in crate::model::nn::kernels) fn flat_mut(lanes: &mut [Lane]) -> &mut [f32] {
-    // SAFETY: as above, and the borrow is unique.
-    unsafe { std::slice::from_raw_parts_mut(lanes.as_mut_ptr().cast(), lanes.len() * LANE) }
 }
 
 /// The same as bfloat16: the upper halves of the f32 bits.

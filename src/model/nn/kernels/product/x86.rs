@@ -1,7 +1,8 @@
 //! Tiles in vector registers.
 #![allow(clippy::needless_range_loop, reason = "tiles are addressed by row and lane")]
 
-use super::{LANE, Start, Stored, Terms, Tile};
+use super::{Start, Stored, Terms, Tile};
+use crate::model::nn::kernels::lane::LANE;
 use std::arch::x86_64::*;
 
 /// Calls `$tile::<rows, lanes>` for the sizes at hand.

@@ -2,21 +2,26 @@
 //!
 //! Every kind of [`super::Value`] runs this list. A new operation is an arm in each function here, over a kernel.
 
+mod conv;
+mod gru;
+mod norm;
+
 use super::{
-    conv1d::Conv,
-    gru,
     kernels::{
         activation::{self, Activation},
         attention::Attention,
         join,
     },
-    layer::WeightsRef,
-    norm::NormKind,
+    weights::WeightsRef,
 };
 use candle_core::{Result, bail};
 
+pub use conv::Conv;
+pub(super) use gru::pack as gru_weight;
+pub use norm::NormKind;
+
 /// An operation on `x` `(batch, steps, channels)` and perhaps others, of the same batch. What it needs to know is here, but for its
-/// parameters, a weight and a bias, which a [`super::Layer`] holds.
+/// parameters, a weight and a bias, which a layer holds.
 #[derive(Clone, Copy, Debug)]
 pub enum Op {
     /// Convolution, transposed convolution or linear layer; weight and bias.
@@ -56,6 +61,11 @@ pub enum Op {
     },
     /// One step alone, `(batch, 1, channels)`.
     Step(usize),
+    /// `(x - other) weight`, the weight a scale of each column.
+    Difference {
+        /// Channels.
+        width: usize,
+    },
     /// Rows where the other, `(batch, steps, 1)`, is 1; the weight, a vector, where it is 0. The mask gets no gradient.
     OrAbsent {
         /// Channels.
@@ -104,7 +114,7 @@ impl Op {
     pub fn form(&self) -> Form {
         match self {
             Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Beside | Self::Channels { .. } | Self::Step(_) => Form::Anew,
-            Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::OrAbsent { .. } => Form::InPlace,
+            Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::Difference { .. } | Self::OrAbsent { .. } => Form::InPlace,
             Self::AddAtEachStep | Self::AddGated => Form::Sum(1),
             Self::Add => Form::Sum(2),
         }
@@ -135,6 +145,7 @@ impl Op {
             }
             Self::Channels { start, len } => beside(&[], start + len <= channels, [batch, steps, len]),
             Self::Step(index) => beside(&[], index < steps, [batch, 1, channels]),
+            Self::Difference { width } => beside(&[x], channels == width, x),
             Self::OrAbsent { width } => beside(&[[batch, steps, 1]], channels == width, x),
         };
         let shapes = || inputs.iter().map(|input| input.shape).collect::<Vec<_>>();
@@ -169,6 +180,7 @@ impl Op {
             }
             Self::Channels { start, len } => join::copy_columns((x, channels, start), (out, len, 0), len),
             Self::Step(index) => join::copy_columns((x, steps * channels, index * channels), (out, channels, 0), channels),
+            Self::Difference { .. } => join::difference(out, other(1), weights.plain()?),
             Self::OrAbsent { .. } => join::or_absent(out, other(1), weights.plain()?),
         }
         Ok(())
@@ -213,6 +225,16 @@ impl Op {
             Self::Channels { start, len } => fill(&mut to[0], |dx| join::copy_columns((grad, len, 0), (dx, channels, start), len)),
             Self::Step(index) => {
                 fill(&mut to[0], |dx| join::copy_columns((grad, channels, 0), (dx, steps * channels, index * channels), channels));
+            }
+            Self::Difference { .. } => {
+                let scale = past.weights.plain()?;
+                fill(&mut to[0], |dx| join::scale_columns(dx, scale));
+                fill(&mut to[1], |dy| {
+                    dy.copy_from_slice(grad);
+                    join::scale_columns(dy, scale);
+                    dy.iter_mut().for_each(|dy| *dy = -*dy);
+                });
+                fill(&mut to[2], |d_scale| join::difference_scale_grad(x, other(1), grad, d_scale));
             }
             Self::OrAbsent { .. } => {
                 if to[1].is_some() {
