@@ -23,7 +23,7 @@ const STATE: usize = 17;
 const ACTION: usize = 6;
 
 fn config(backbone: Backbone) -> ModelConfig {
-    let latent = GruLatent { dim: 20, hidden: 64, looks: Looks::Block(10), future: Future::Prior };
+    let latent = GruLatent { dim: 20, hidden: 64, looks: Looks::Block(10), future: Future::Prior, baseline: None };
     let mut config = ModelConfig::plain(Layout { state_dim: STATE, action_dim: ACTION }, Some(latent), backbone);
     (config.method.plan.horizon, config.method.plan.level_max) = (T, 150);
     config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
@@ -88,7 +88,7 @@ fn train_step(c: &mut Criterion) {
         let networks = Networks::new(config.layout, &config.method, &params).expect("sizes fit");
         let token = TokenRef { state: Some(&[0.1; STATE]), action: Some(&[0.1; ACTION]), reward: Some(0.1), noise: 0.0 };
         let batch = WindowBatch {
-            history: Tokens::pack(config.layout, 0..batch_size, 10, |_, _| token).expect("packs"),
+            history: Tokens::pack(config.layout, 0..batch_size, 10, None, |_, _| token).expect("packs"),
             history_lens: None,
             window: random([batch_size, T, STATE + ACTION]),
             observed: None,

@@ -82,7 +82,13 @@ impl Flags {
             Net::Dit => Backbone::Dit { width: self.width, depth: self.depth, heads: self.heads },
         };
         let looks = Looks::Block(self.block_len);
-        let latent = (self.latent_dim > 0).then_some(GruLatent { dim: self.latent_dim, hidden: self.hidden, looks, future: Future::Prior });
+        let latent = (self.latent_dim > 0).then_some(GruLatent {
+            dim: self.latent_dim,
+            hidden: self.hidden,
+            looks,
+            future: Future::Prior,
+            baseline: None,
+        });
         let layout = Layout { state_dim: self.state_dim, action_dim: self.action_dim };
         let mut config = ModelConfig::plain(layout, latent, backbone);
         (config.method.plan.horizon, config.method.plan.level_max) = (self.plan_horizon, self.level_max);

@@ -113,7 +113,7 @@ fn config(flags: &Flags) -> ModelConfig {
         Net::Unet => Backbone::Unet { widths: flags.widths.clone() },
         Net::Dit => Backbone::Dit { width: flags.width, depth: flags.depth, heads: flags.width / 32 },
     };
-    let latent = GruLatent { dim: LATENT, hidden: 64, looks: Looks::Block(4), future: Future::Prior };
+    let latent = GruLatent { dim: LATENT, hidden: 64, looks: Looks::Block(4), future: Future::Prior, baseline: None };
     let mut config = ModelConfig::plain(LAYOUT, Some(latent), backbone);
     (config.method.plan.horizon, config.method.plan.level_max) = (flags.len, LEVELS);
     config

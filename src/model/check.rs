@@ -7,7 +7,7 @@ use crate::model::{
     denoiser,
     diffusion::schedule::Table,
     fit::{Unfit, WIDTH_MAX, require, size},
-    method::{Diffusion, Future, GruLatent, Looks, Method, Schedule},
+    method::{Baseline, Diffusion, Future, GruLatent, Looks, Method, Schedule},
     nn::{params::Params, plain},
     options::SamplerOptions,
     trajectory::Layout,
@@ -88,14 +88,19 @@ impl ModelConfig {
             Schedule::Uniform { steps } => size("method.plan.schedule.steps", *steps, *level_max)?,
         }
         if let Some(gru) = latent.gru() {
-            let GruLatent { dim, hidden, looks: _, future: _ } = gru;
+            let GruLatent { dim, hidden, looks: _, future: _, baseline } = gru;
             size("method.latent.dim", *dim, WIDTH_MAX)?;
             size("method.latent.hidden", *hidden, WIDTH_MAX)?;
+            if let Some(Baseline { width }) = baseline {
+                size("method.latent.baseline.width", *width, WIDTH_MAX)?;
+            }
             match gru.looks {
                 Looks::Block(len) => size("method.latent.looks", len, HISTORY_MAX)?,
                 Looks::Running => {
-                    let reason = "running takes future = held: a posterior that waits for its successor would have to read each step twice";
-                    require(gru.future == Future::Held, "method.latent.looks", reason)?;
+                    let reason = "running takes chunks of one action, or future = held: its memory holds real steps alone, and a refinement \
+                                  within a chunk would look back on imagined ones";
+                    let alone = self.trained.action_horizons == [1] || !self.trained.refined;
+                    require(gru.future == Future::Held || alone, "method.latent.looks", reason)?;
                 }
             }
         }

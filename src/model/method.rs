@@ -38,6 +38,18 @@ pub struct GruLatent {
     /// What the latents of later steps are.
     #[serde(default)]
     pub future: Future,
+    /// What needs no context; the latent explains the rest. Absent: it explains all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub baseline: Option<Baseline>,
+}
+
+/// Models without a context, f0(s, a) of the state change and the reward and g0(s) of the action: the encoder sees how far off they are, and
+/// the decoders of the latent explain just that. What everybody knows would otherwise drown what the context does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Baseline {
+    /// Of their two hidden layers.
+    pub width: usize,
 }
 
 /// What is known of the latents of steps to come.
@@ -130,6 +142,11 @@ impl LatentSource {
             Self::None => None,
             Self::Gru(gru) => Some(gru),
         }
+    }
+
+    /// What of it needs no context, if that is told apart.
+    pub fn baseline(&self) -> Option<Baseline> {
+        self.gru().and_then(|gru| gru.baseline)
     }
 
     /// Width of the latent; 0 without one.

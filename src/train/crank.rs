@@ -4,8 +4,8 @@ use super::{
     Outcome, TRAINING_DIR, Task, gate,
     learner::Learner,
     log::Log,
-    losses::Objective,
-    recipe::stages::Stage,
+    losses::{Objective, context_free::measure_surprises},
+    recipe::{losses::Loss, stages::Stage},
     resume::Store,
     ship::{self, Product},
 };
@@ -57,6 +57,9 @@ impl Crank<'_> {
                 };
                 self.log.say(&format!("checkpoint in {}: {:#}", self.out.display(), product.metrics()));
                 return Ok(Outcome::Finished);
+            }
+            if self.stage(learner).weight(Loss::ContextFree) > 0.0 {
+                measure_surprises(self.task, &learner.networks, &learner.vars)?;
             }
             if self.passes_gate(learner)? {
                 learner.enter_next(self.task)?;

@@ -111,13 +111,21 @@ fn equip(stage: &Stage, vars: &BTreeMap<String, Var>) -> Result<(Adam, Option<Em
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{model::config::ModelConfig, train::tests::recipe_with};
+    use crate::{
+        model::{
+            method::{Baseline, LatentSource},
+            trajectory::Layout,
+        },
+        train::tests::recipe_with,
+    };
 
     /// A variable without a group would never be trained.
     #[test]
     fn every_variable_has_a_group() {
-        let recipe = recipe_with(&[]).unwrap();
-        let config: ModelConfig = recipe.config(crate::model::trajectory::Layout { state_dim: 3, action_dim: 2 });
+        let mut recipe = recipe_with(&[]).unwrap();
+        let LatentSource::Gru(gru) = &mut recipe.model.latent else { panic!("a latent") };
+        gru.baseline = Some(Baseline { width: 4 });
+        let config = recipe.config(Layout { state_dim: 3, action_dim: 2 });
         let params = Params::fresh(0);
         Networks::new(config.layout, &config.method, &params).unwrap();
         let groups: std::collections::BTreeSet<_> =

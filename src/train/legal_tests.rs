@@ -1,6 +1,11 @@
 //! Every recipe that the check accepts ships a checkpoint that loads; the others are refused before training; and the recipes that ship.
 
-use super::{Task, dataset::room::Room, recipe::Recipe, tests::recipe_with};
+use super::{
+    Task,
+    dataset::room::Room,
+    recipe::{Recipe, keys::leaves},
+    tests::recipe_with,
+};
 use crate::model::{
     Networks,
     checkpoint::{Provenance, load, save},
@@ -171,19 +176,9 @@ fn shipped_recipes_are_right_and_hold_every_key() {
         let tells = recipe.model.latent.gru().is_some();
         assert!(tells || !recipe.sampler.streaming, "{}: nothing tells when a window is stale", path.display());
         let (written, known) = (toml::from_str(&text).unwrap(), toml::from_str(&recipe.to_toml()).unwrap());
+        let keys = |table: &toml::Table| leaves(table).into_keys().collect::<Vec<_>>();
         assert_eq!(keys(&written), keys(&known), "{}: a key without a line", path.display());
         count += 1;
     }
     assert!(count >= 9);
-}
-
-/// Dotted names of all values of a table.
-fn keys(table: &toml::Table) -> Vec<String> {
-    let inner = |(name, value): (&String, &toml::Value)| match value.as_table() {
-        Some(table) => keys(table).iter().map(|key| format!("{name}.{key}")).collect(),
-        None => vec![name.clone()],
-    };
-    let mut names: Vec<String> = table.iter().flat_map(inner).collect();
-    names.sort();
-    names
 }

@@ -16,7 +16,7 @@ use crate::model::{
         refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
         schedule::Table,
     },
-    method::{Backbone, Future, GruLatent, Looks, Schedule},
+    method::{Backbone, Baseline, Future, GruLatent, LatentSource, Looks, Schedule},
     nn::Params,
     noise::Philox,
     options::SamplerOptions,
@@ -28,13 +28,29 @@ const STEPS: usize = 24;
 const BATCH: usize = 16;
 
 fn config(latent: Option<(Looks, Future)>, schedule: Schedule, obs_horizon: usize, sub_steps: usize) -> ModelConfig {
-    let latent = latent.map(|(looks, future)| GruLatent { dim: 5, hidden: 16, looks, future });
+    let latent = latent.map(|(looks, future)| GruLatent { dim: 5, hidden: 16, looks, future, baseline: None });
     let mut config = ModelConfig::plain(LAYOUT, latent, Backbone::Unet { widths: vec![8, 16] });
     (config.method.plan.schedule, config.method.plan.obs_horizon) = (schedule, obs_horizon);
     config.trained.sub_steps = vec![sub_steps];
     let kappa = if config.method.can_refine() { f32::INFINITY } else { 0.0 };
     config.trained.refined = config.method.can_refine();
-    config.defaults.sampler = SamplerOptions { sub_steps, action_horizon: 3, kappa, streaming: false, ..SamplerOptions::default() };
+    let running = config.method.latent.gru().is_some_and(|gru| gru.looks == Looks::Running);
+    config.trained.action_horizons = if config.trained.refined && running { vec![1] } else { vec![1, 2, 3] };
+    config.defaults.sampler = SamplerOptions {
+        sub_steps,
+        action_horizon: config.trained.action_horizons.len(),
+        kappa,
+        streaming: false,
+        ..SamplerOptions::default()
+    };
+    config
+}
+
+/// The same beside a baseline, whose surprises the encoder sees.
+fn beside_baseline(mut config: ModelConfig) -> ModelConfig {
+    let LatentSource::Gru(gru) = &mut config.method.latent else { panic!("a latent") };
+    gru.baseline = Some(Baseline { width: 7 });
+    config.check().unwrap();
     config
 }
 
@@ -91,7 +107,7 @@ fn check(config: &ModelConfig, hide: Hide) {
         obs_horizon: plan.obs_horizon,
         table: Table::new(plan.schedule, plan.horizon, sampler.sub_steps, plan.level_max).unwrap(),
         levels: Levels::Schedule,
-        action_horizons: if config.trained.refined || latents_free { vec![1, 2, 3] } else { vec![1] },
+        action_horizons: if config.trained.refined || latents_free { config.trained.action_horizons.clone() } else { vec![1] },
         ready_fraction: 0.5,
         hide,
     };
@@ -149,11 +165,23 @@ fn whole_histories() {
         (Some((Looks::Block(6), Future::Held)), ladder, 1, 1),
         (Some((Looks::Block(6), Future::Held)), uniform, 1, 1),
         (Some((Looks::Running, Future::Held)), ladder, 1, 1),
+        (Some((Looks::Running, Future::Prior)), ladder, 2, 1),
         (Some((Looks::Running, Future::Held)), ladder, 3, 2),
         (None, ladder, 4, 1),
         (None, uniform, 1, 1),
     ] {
         check(&config(latent, schedule, obs_horizon, sub_steps), Hide::NOTHING);
+    }
+}
+
+#[test]
+fn surprises() {
+    let (ladder, hide) = (Schedule::Ladder, Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    for (looks, future, obs_horizon) in
+        [(Looks::Block(6), Future::Prior, 1), (Looks::Running, Future::Prior, 3), (Looks::Running, Future::Held, 1)]
+    {
+        let config = beside_baseline(config(Some((looks, future)), ladder, obs_horizon, 1));
+        [Hide::NOTHING, hide].into_iter().for_each(|hide| check(&config, hide));
     }
 }
 

@@ -45,7 +45,7 @@ fn asked_during(work: impl FnOnce()) -> usize {
 }
 
 fn agent(backbone: Backbone, obs_horizon: usize) -> Agent {
-    let latent = GruLatent { dim: 5, hidden: 16, looks: Looks::Block(4), future: Future::Prior };
+    let latent = GruLatent { dim: 5, hidden: 16, looks: Looks::Block(4), future: Future::Prior, baseline: None };
     let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, Some(latent), backbone);
     config.method.plan.obs_horizon = obs_horizon;
     // Every warm act is noised again a little.

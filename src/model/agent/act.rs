@@ -183,6 +183,11 @@ impl Act {
         self.episode.unread()
     }
 
+    /// The token before [`Self::unread`].
+    pub(super) fn last_read(&self) -> Option<TokenRef<'_>> {
+        self.episode.last_read()
+    }
+
     /// See [`Episode::remember`].
     pub(super) fn remember(&mut self, state: &[f32], keep: usize) {
         self.episode.remember(state, keep);

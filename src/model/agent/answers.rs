@@ -38,21 +38,22 @@ impl Agent {
     /// Where a GRU runs on over the episode: its states after all that was executed, `(B, 1, hidden)` for the acts that ask the filter. Each
     /// token is read once, and rows read as many as they have.
     fn read_on(&self, latent: &LatentModel, acts: &mut [Act]) -> Result<Option<Buffer>> {
-        let width = self.config().method.latent.gru().map_or(0, GruLatent::memory_len);
-        if width == 0 {
-            return Ok(None);
-        }
-        let states = |acts: &[Act], which: &dyn Fn(&Act) -> bool| {
-            rows::gather(acts, which, [1, width], &|act, out| out.copy_from_slice(act.memory()))
-        };
         let reads = |act: &Act| act.asks(Ask::Filter) && act.unread().is_some();
         while acts.iter().any(reads) {
-            let tokens = rows::unread(acts, reads, self.config().layout)?;
-            let after = latent.read(&tokens, Some(&states(acts, &reads)?))?;
+            let tokens = rows::unread(acts, reads, self.config())?;
+            let after = latent.read(&tokens, self.memories(acts, &reads)?.as_ref())?;
+            let [_, _, width] = after.shape()?;
             let keep = self.config().method.plan.obs_horizon;
             acts.iter_mut().filter(|act| reads(act)).zip(after.chunks_exact(width)).for_each(|(act, state)| act.remember(state, keep));
         }
-        states(acts, &|act| act.asks(Ask::Filter)).map(Some)
+        self.memories(acts, &|act| act.asks(Ask::Filter))
+    }
+
+    /// States of a GRU that runs on, of the acts that `which` takes; none where each looks anew.
+    fn memories(&self, acts: &[Act], which: &dyn Fn(&Act) -> bool) -> Result<Option<Buffer>> {
+        let width = self.config().method.latent.gru().map_or(0, GruLatent::memory_len);
+        let states = || rows::gather(acts, which, [1, width], &|act, out| out.copy_from_slice(act.memory()));
+        (width > 0).then(states).transpose()
     }
 
     /// Zig-zag: at READY the latent of position 0 is the posterior given the noised positions 0 and 1, held in a trust region around the
@@ -60,7 +61,8 @@ impl Agent {
     fn refine(&self, acts: &mut [Act]) -> Result<()> {
         let wants = |act: &Act| act.asks(Ask::Refine);
         let Some(latent) = &self.networks().latent else { return Ok(()) };
-        let posterior = latent.infer(&rows::blocks(acts, wants, Evidence::Refinement, self.config(), self.walk())?, None)?;
+        let block = rows::blocks(acts, wants, Evidence::Refinement, self.config(), self.walk())?;
+        let posterior = latent.infer(&block, self.memories(acts, &wants)?.as_ref())?;
         let [count, _, dim] = posterior.mean.shape()?;
         let mut log_var = Buffer::generate([count, 1, dim], |out| out.copy_from_slice(&posterior.log_var))?;
         let mean = Buffer::generate([count, 1, dim], |mean| {

@@ -60,12 +60,17 @@ impl Episode {
         Self { seed, options, time: 0, history, memory, unread: 0, planned: None, window: None, latent: None }
     }
 
-    pub(super) fn reset(&self, seed: u64, keep_history: bool) -> Self {
+    /// See [`super::Agent::reset`]; with `border`, a token of which nothing is known stands between the old episode and the new one.
+    pub(super) fn reset(&self, seed: u64, keep_history: bool, border: bool) -> Self {
         let mut fresh = Self::new(seed, self.options.clone(), self.memory.len());
         if keep_history {
             fresh.history.clone_from(&self.history);
             fresh.memory.clone_from(&self.memory);
             fresh.unread = self.unread;
+            if border {
+                fresh.history.push_back(Token::default());
+                fresh.unread += usize::from(!fresh.memory.is_empty());
+            }
         }
         fresh
     }
@@ -76,7 +81,8 @@ impl Episode {
         if !self.memory.is_empty() {
             self.unread += executed.len();
         }
-        let keep = keep.max(self.unread);
+        // The one before the first that is to be read is looked at too.
+        let keep = if self.unread > 0 { keep.max(self.unread + 1) } else { keep };
         let surplus = (self.history.len() + executed.len()).saturating_sub(keep);
         self.history.drain(..surplus.min(self.history.len()));
         self.history.extend(executed.into_iter().rev().take(keep).rev());
@@ -91,6 +97,11 @@ impl Episode {
     /// The oldest token that it has not read.
     pub(super) fn unread(&self) -> Option<TokenRef<'_>> {
         self.past(self.unread.checked_sub(1)?)
+    }
+
+    /// The token before that one.
+    pub(super) fn last_read(&self) -> Option<TokenRef<'_>> {
+        self.past(self.unread)
     }
 
     /// It has read that token. When all are read, the last `keep` are kept.

@@ -6,7 +6,7 @@ use crate::model::{
     diffusion::descent::Walk,
     latent::{Evidence, Gaussian, GaussianRef, Tokens},
     nn::{Buffer, Value},
-    trajectory::{Layout, TokenRef},
+    trajectory::TokenRef,
 };
 use candle_core::Result;
 
@@ -33,26 +33,30 @@ pub(super) fn set_latents(latents: &Gaussian<Buffer>, acts: &mut [Act], which: i
 }
 
 /// What the encoder sees of each act: the last tokens of its past, wholly absent ones in front where there are fewer, and the evidence
-/// behind them.
-pub(super) fn blocks(
-    acts: &[Act],
+/// behind them. Beside a baseline, with what came before each; nothing is known of what came before a block, in training as here.
+pub(super) fn blocks<'a>(
+    acts: &'a [Act],
     which: impl Fn(&Act) -> bool,
     evidence: Evidence,
     config: &ModelConfig,
-    walk: Walk,
+    walk: Walk<'a>,
 ) -> Result<Tokens<Buffer>> {
     let block_len = config.method.latent.block_len();
     let ahead = evidence.ahead_within(config.method.plan.horizon);
     let rows = acts.iter().filter(|act| which(act));
-    Tokens::pack(config.layout, rows, block_len + ahead.len(), |act, position| match position.checked_sub(block_len) {
+    let last = |act: &'a Act| if block_len > 0 { TokenRef::default() } else { act.past(0, walk).unwrap_or_default() };
+    let first = config.method.latent.baseline().map(|_| &last as &dyn Fn(&'a Act) -> TokenRef<'a>);
+    Tokens::pack(config.layout, rows, block_len + ahead.len(), first, |act, position| match position.checked_sub(block_len) {
         None => act.past(block_len - 1 - position, walk).unwrap_or_default(),
         Some(i) => act.ahead(i, evidence, walk).only(ahead[i]),
     })
 }
 
 /// The oldest token that each act's GRU has not read, `(B, 1)`.
-pub(super) fn unread(acts: &[Act], which: impl Fn(&Act) -> bool, layout: Layout) -> Result<Tokens<Buffer>> {
-    Tokens::pack(layout, acts.iter().filter(|act| which(act)), 1, |act, _| act.unread().unwrap_or_default())
+pub(super) fn unread<'a>(acts: &'a [Act], which: impl Fn(&Act) -> bool, config: &ModelConfig) -> Result<Tokens<Buffer>> {
+    let last = |act: &'a Act| act.last_read().unwrap_or_default();
+    let first = config.method.latent.baseline().map(|_| &last as &dyn Fn(&'a Act) -> TokenRef<'a>);
+    Tokens::pack(config.layout, acts.iter().filter(|act| which(act)), 1, first, |act, _| act.unread().unwrap_or_default())
 }
 
 /// The last `steps` real steps (state, action) of each act, oldest first, zeros where unknown: `(B, 1, steps * D)`.

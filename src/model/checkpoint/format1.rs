@@ -55,7 +55,7 @@ impl From<ConfigV1> for ModelConfig {
     fn from(old: ConfigV1) -> Self {
         let with = |beside: Vec<usize>, default: usize| beside.into_iter().chain([default]).collect::<BTreeSet<_>>().into_iter().collect();
         let gru = |LatentV1 { dim, hidden }| {
-            LatentSource::Gru(GruLatent { dim, hidden, looks: Looks::Block(old.block_len), future: Future::Prior })
+            LatentSource::Gru(GruLatent { dim, hidden, looks: Looks::Block(old.block_len), future: Future::Prior, baseline: None })
         };
         let plan = Diffusion {
             horizon: old.plan_horizon,

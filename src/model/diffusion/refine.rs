@@ -84,9 +84,8 @@ impl WindowBatch {
     /// If there are not so many.
     pub fn narrow(&self, start: usize, len: usize) -> Result<Self> {
         let cut = |tensor: &Tensor| tensor.narrow(0, start, len)?.contiguous();
-        let Tokens { state, action, reward, present, noise } = &self.history;
         Ok(Self {
-            history: Tokens { state: cut(state)?, action: cut(action)?, reward: cut(reward)?, present: cut(present)?, noise: cut(noise)? },
+            history: self.history.map(cut)?,
             history_lens: self.history_lens.as_ref().map(|lens| lens[start..start + len].to_vec()),
             window: cut(&self.window)?,
             observed: self.observed.as_ref().map(cut).transpose()?,
@@ -253,6 +252,7 @@ fn window_tokens(batch: &WindowBatch, x: &Tensor, seen: &[Seen], sigma: Option<&
         reward: zeros.clone(),
         noise: sigma.map_or(Ok(zeros), |sigma| sigma.narrow(1, 0, len)?.contiguous())?,
         present,
+        before: None,
     })
 }
 

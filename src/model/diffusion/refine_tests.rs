@@ -18,7 +18,7 @@ const STATE: usize = 3;
 
 fn config() -> ModelConfig {
     let layout = Layout { state_dim: STATE, action_dim: DIM - STATE };
-    let latent = GruLatent { dim: 4, hidden: 8, looks: Looks::Block(3), future: Future::Prior };
+    let latent = GruLatent { dim: 4, hidden: 8, looks: Looks::Block(3), future: Future::Prior, baseline: None };
     let mut config = ModelConfig::plain(layout, Some(latent), Backbone::Dit { width: 16, depth: 1, heads: 2 });
     (config.method.plan.horizon, config.method.plan.level_max) = (LEN, 20);
     config
@@ -43,7 +43,7 @@ fn batch(window: Vec<f32>, noise: Vec<f32>, row: usize) -> WindowBatch {
     let history: Vec<Vec<Token>> = (0..BATCH).map(|b| (0..3).map(|i| token(b + i)).collect()).collect();
     let tensor = |values| Tensor::from_vec(values, (BATCH, LEN, DIM), &Device::Cpu).unwrap();
     WindowBatch {
-        history: Tokens::pack(config().layout, history.iter(), 3, |row, position| row[position].view()).unwrap(),
+        history: Tokens::pack(config().layout, history.iter(), 3, None, |row, position| row[position].view()).unwrap(),
         history_lens: None,
         window: tensor(window),
         observed: None,

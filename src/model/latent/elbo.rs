@@ -1,6 +1,6 @@
 //! Evidence lower bound over a block (equation of section 4.2; appendix A.4).
 
-use super::{Gaussian, LatentModel, Tokens};
+use super::{Baseline, Gaussian, LatentModel, Surprises, Tokens};
 use crate::model::trajectory::Seen;
 use candle_core::{Device, Result, Tensor};
 
@@ -26,18 +26,26 @@ pub struct ElboOptions {
     pub kl_weight: f64,
     /// Standard deviation of the state change in normalized units, `state_dim` values.
     pub state_change_std: Vec<f32>,
-    /// Weight of the reward's squared error against the mean over the state's columns.
+    /// Weight of the state's squared error.
+    pub state_weight: f64,
+    /// Weight of the reward's squared error; of a model without a baseline, against the mean over the state's columns.
     pub reward_weight: f64,
+    /// Weight of the action's squared error; beside a baseline.
+    pub action_weight: f64,
+    /// Nats of a step's KL that cost nothing (Kingma et al. 2016).
+    pub free_bits: f64,
 }
 
 /// Scalars of one evaluation.
 pub struct ElboTerms {
     /// What is minimised.
     pub loss: Tensor,
-    /// Mean squared residual of states, in units of the state change's variance.
+    /// Mean squared residual of states, in units of the state change's variance; beside a baseline of its surprise's.
     pub state_error: Tensor,
-    /// Mean squared residual of rewards, normalized units.
+    /// Mean squared residual of rewards, normalized units, or those of its surprise.
     pub reward_error: Tensor,
+    /// The same of actions, beside a baseline.
+    pub action_error: Option<Tensor>,
     /// KL(q || p), summed over latent dimensions, mean over positions.
     pub kl: Tensor,
 }
@@ -49,21 +57,34 @@ impl LatentModel {
     /// # Errors
     /// If widths differ.
     pub fn posteriors(&self, tokens: &Tokens, history_shown: &Tensor, successor_shown: &Tensor) -> Result<Gaussian> {
+        self.posteriors_beside(self.surprises(tokens)?.as_ref(), tokens, history_shown, successor_shown)
+    }
+
+    /// How far each token of a block is from what was expected: facts, of which the encoder is shown some and the decoders have to explain all.
+    fn surprises(&self, tokens: &Tokens) -> Result<Option<Surprises>> {
+        let of = |baseline: &Baseline| baseline.surprises(&tokens.clone().following(None)?)?.map(|surprise| Ok(surprise.detach()));
+        self.baseline.as_ref().map(of).transpose()
+    }
+
+    fn posteriors_beside(
+        &self,
+        surprises: Option<&Surprises>,
+        tokens: &Tokens,
+        history_shown: &Tensor,
+        successor_shown: &Tensor,
+    ) -> Result<Gaussian> {
         let (batch, len) = tokens.batch_len()?;
         let (mut history, mut successors) = (tokens.narrow(0, len - 1)?, tokens.narrow(1, len - 1)?);
         history.present = history.present.mul(&history_shown.narrow(1, 0, len - 1)?)?;
         successors.present = successors.present.mul(successor_shown)?;
-        let states = self.encoder.states(&history, None)?;
+        let history = self.noticed(history, None)?;
+        let cut = |from: usize| surprises.map(|all| all.map(|surprise| surprise.narrow(1, from, len - 1)?.contiguous())).transpose();
+        let states = self.encoder.states(&history, cut(0)?.as_ref(), None)?;
         let rows = batch * (len - 1);
         let flat = |t: &Tensor| t.reshape((rows, 1, ()));
-        let successors = Tokens {
-            state: flat(&successors.state)?,
-            action: flat(&successors.action)?,
-            reward: flat(&successors.reward)?,
-            present: flat(&successors.present)?,
-            noise: flat(&successors.noise)?,
-        };
-        let after = self.encoder.states(&successors, Some(&states.reshape((rows, 1, ()))?))?;
+        let successors = self.noticed(successors.map(flat)?, Some(&history.map(flat)?))?;
+        let to_successors = cut(1)?.map(|surprises| surprises.map(flat)).transpose()?;
+        let after = self.encoder.states(&successors, to_successors.as_ref(), Some(&states.reshape((rows, 1, ()))?))?;
         self.encoder.posterior(&after.reshape((batch, len - 1, ()))?)
     }
 
@@ -73,55 +94,88 @@ impl LatentModel {
     /// State residuals are in units of the standard deviation of the state *change*: in units of the state the part that a hidden context
     /// explains is too small to pay for its KL (measured on Point-Wind-S: the wind is not identified). A likelihood with fitted variances
     /// does worse still: where two columns share one noise (position and velocity) it pays without bound to code that noise (measured:
-    /// probe error .99).
+    /// probe error .99). Beside a baseline they are surprises, in units of their own standard deviation on held-out episodes, and count as half
+    /// the sum of squares: the logarithm of a Gaussian likelihood, against which a KL weight of 1 is the ELBO itself.
     ///
     /// # Errors
     /// If shapes differ.
     pub fn elbo(&self, batch: &ElboBatch, options: &ElboOptions) -> Result<ElboTerms> {
         let (_, len) = batch.tokens.batch_len()?;
-        let Explained { q, from } = self.explained(batch)?;
+        let surprises = self.surprises(&batch.tokens)?;
+        let Explained { q, from } = self.explained(surprises.as_ref(), batch)?;
         let (steps, valid) = (len - 1 - from, batch.valid.narrow(1, from, len - 1 - from)?);
         let latent = q.sample(&batch.eps.narrow(1, from, steps)?)?;
-        let (now, next) = (batch.tokens.narrow(from, steps)?, batch.tokens.narrow(from + 1, steps)?);
-        let (change, reward) = self.decoder.predict(&now.state, &now.action, &latent)?;
-        let std = Tensor::new(options.state_change_std.as_slice(), change.device())?;
-        let target = (&next.state - &now.state)?.broadcast_div(&std)?;
+        let aims = Aims::new(&batch.tokens, surprises.as_ref(), from, options)?;
+        let now = batch.tokens.narrow(from, steps)?;
+        let told = self.decoder.predict(&now.state, &now.action, &latent)?;
         let count = valid.sum_all()?;
-        let column_error = |residual: Tensor| -> Result<Tensor> {
-            residual.sqr()?.broadcast_mul(&valid.unsqueeze(2)?)?.sum((0, 1))?.broadcast_div(&count)
+        let error = |told: Tensor, aim: &Tensor| -> Result<Tensor> {
+            let squares = (told - aim)?.sqr()?.broadcast_mul(&valid.unsqueeze(2)?)?;
+            squares.sum((0, 1))?.broadcast_div(&count)?.mean_all()
         };
-        let (state_error, reward_error) = (column_error((change - target)?)?, column_error((reward - &now.reward)?)?);
-        let (state_error, reward_error) = (state_error.mean_all()?, reward_error.mean_all()?);
-        let kl = self.block_kl(&q, &valid)?;
-        let rec = (&state_error + reward_error.affine(options.reward_weight, 0.0)?)?;
+        // Of a sum of squares over the columns half, or their mean.
+        let half = |width: usize| if self.baseline.is_some() { width as f64 / 2.0 } else { 1.0 };
+        let state_error = error(told.state, &aims.state)?;
+        let reward_error = error(told.reward, &aims.reward)?;
+        let action_error = told.action.zip(aims.action).map(|(told, aim)| error(told, &aim)).transpose()?;
+        let kl = self.block_kl(&q, &valid, options.free_bits)?;
+        let weighted = |error: &Tensor, weight: f64| if weight == 1.0 { Ok(error.clone()) } else { error.affine(weight, 0.0) };
+        let mut rec = (weighted(&state_error, options.state_weight * half(now.state.dim(2)?))?
+            + reward_error.affine(options.reward_weight * half(1), 0.0)?)?;
+        if let Some(error) = &action_error {
+            rec = (rec + error.affine(options.action_weight * half(now.action.dim(2)?), 0.0)?)?;
+        }
         let loss = (rec + kl.affine(options.kl_weight, 0.0)?)?;
-        Ok(ElboTerms { loss, state_error, reward_error, kl })
+        Ok(ElboTerms { loss, state_error, reward_error, action_error, kl })
     }
 
     /// The latents that explain the steps of a block, and the first step that has one: c_t of a model with a prior waits for what is shown of
     /// x_{t+1}, from the first step on; a belief that is held is all that is known before the step, from the second step on.
-    fn explained(&self, batch: &ElboBatch) -> Result<Explained> {
+    fn explained(&self, surprises: Option<&Surprises>, batch: &ElboBatch) -> Result<Explained> {
+        let ElboBatch { tokens, history_shown, successor_shown, .. } = batch;
         if self.prior.is_some() {
-            return Ok(Explained { q: self.posteriors(&batch.tokens, &batch.history_shown, &batch.successor_shown)?, from: 0 });
+            return Ok(Explained { q: self.posteriors_beside(surprises, tokens, history_shown, successor_shown)?, from: 0 });
         }
         let state = Tensor::new(&Seen::STATE.flags(), &Device::Cpu)?;
         let shown = state.broadcast_as(batch.successor_shown.shape())?.contiguous()?;
-        let beliefs = self.posteriors(&batch.tokens, &batch.history_shown, &shown)?;
+        let beliefs = self.posteriors_beside(surprises, tokens, history_shown, &shown)?;
         let steps = beliefs.mean.dim(1)? - 1;
         Ok(Explained { q: beliefs.narrow(0, steps)?, from: 1 })
     }
 
-    /// KL to the prior of each step but the first, or of a held belief to N(0, I).
-    fn block_kl(&self, q: &Gaussian, valid: &Tensor) -> Result<Tensor> {
+    /// KL to the prior of each step but the first, or of a held belief to N(0, I); what of a step is below `free` counts as that.
+    fn block_kl(&self, q: &Gaussian, valid: &Tensor, free: f64) -> Result<Tensor> {
+        let paid = |kl: Tensor| if free > 0.0 { kl.maximum(free) } else { Ok(kl) };
         let Some(prior) = &self.prior else {
             let standard = Gaussian { mean: q.mean.zeros_like()?, log_var: q.mean.zeros_like()? };
-            return (q.kl(&standard)? * valid)?.sum_all()? / valid.sum_all()?;
+            return (paid(q.kl(&standard)?)? * valid)?.sum_all()? / valid.sum_all()?;
         };
         let steps = q.mean.dim(1)?;
         let prior = prior.predict(&q.narrow(0, steps - 1)?)?;
         let valid = valid.narrow(1, 1, steps - 1)?;
-        let kl = (q.narrow(1, steps - 1)?.kl(&prior)? * &valid)?.sum_all()?;
+        let kl = (paid(q.narrow(1, steps - 1)?.kl(&prior)?)? * &valid)?.sum_all()?;
         kl / valid.sum_all()?
+    }
+}
+
+/// What latents have to explain of each step, `(B, steps, ..)`: surprises, or where nothing is known beside them all there is.
+struct Aims {
+    state: Tensor,
+    reward: Tensor,
+    action: Option<Tensor>,
+}
+
+impl Aims {
+    /// From step `from` of a block on.
+    fn new(tokens: &Tokens, surprises: Option<&Surprises>, from: usize, options: &ElboOptions) -> Result<Self> {
+        let steps = tokens.batch_len()?.1 - 1 - from;
+        let cut = |tensor: &Tensor, at: usize| tensor.narrow(1, at, steps)?.contiguous();
+        let Some(Surprises { state, action, reward }) = surprises else {
+            let change = (cut(&tokens.state, from + 1)? - cut(&tokens.state, from)?)?;
+            let std = Tensor::new(options.state_change_std.as_slice(), change.device())?;
+            return Ok(Self { state: change.broadcast_div(&std)?, reward: cut(&tokens.reward, from)?, action: None });
+        };
+        Ok(Self { state: cut(state, from + 1)?, reward: cut(reward, from)?, action: Some(cut(action, from)?) })
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::model::{
-    method::{Future, GruLatent, Looks},
+    method::{Baseline, Future, GruLatent, Looks},
     nn::params::Params,
     noise::Philox,
     trajectory::{Layout, Token},
@@ -18,7 +18,14 @@ fn layout() -> Layout {
 }
 
 fn options() -> ElboOptions {
-    ElboOptions { kl_weight: 0.3, state_change_std: vec![0.5, 1.0, 2.0], reward_weight: 0.7 }
+    ElboOptions {
+        kl_weight: 0.3,
+        state_change_std: vec![0.5, 1.0, 2.0],
+        state_weight: 1.0,
+        reward_weight: 0.7,
+        action_weight: 0.6,
+        free_bits: 0.0,
+    }
 }
 
 /// The second row begins before its episode: two absent tokens.
@@ -42,7 +49,7 @@ fn batch() -> ElboBatch {
     let shown = (0..BATCH * LEN).flat_map(|i| if i / LEN == 2 { [f32::from(i % 2 == 0), 1.0, 0.0] } else { [1.0; 3] }).collect::<Vec<_>>();
     let tensor = |values: Vec<f32>, width| Tensor::from_vec(values, (BATCH, LEN - 1, width), &Device::Cpu).unwrap();
     ElboBatch {
-        tokens: Tokens::pack(layout(), rows.iter(), LEN, |row, position| row[position].view()).unwrap(),
+        tokens: Tokens::pack(layout(), rows.iter(), LEN, None, |row, position| row[position].view()).unwrap(),
         valid: tensor(valid, 1).squeeze(2).unwrap(),
         history_shown: Tensor::from_vec(shown, (BATCH, LEN, 3), &Device::Cpu).unwrap(),
         successor_shown: tensor(present, 3),
@@ -51,7 +58,11 @@ fn batch() -> ElboBatch {
 }
 
 fn model_of(future: Future, params: &Params) -> LatentModel {
-    LatentModel::new(&GruLatent { dim: DIM, hidden: 7, looks: Looks::Block(4), future }, layout(), params).unwrap()
+    beside(None, future, params)
+}
+
+fn beside(baseline: Option<Baseline>, future: Future, params: &Params) -> LatentModel {
+    LatentModel::new(&GruLatent { dim: DIM, hidden: 7, looks: Looks::Block(4), future, baseline }, layout(), params).unwrap()
 }
 
 fn model(params: &Params) -> LatentModel {
@@ -65,14 +76,21 @@ fn loss(model: &LatentModel) -> f64 {
 /// Gradient of every parameter along a random direction.
 #[test]
 fn gradient_is_the_central_difference() {
-    [Future::Prior, Future::Held].into_iter().for_each(check_gradient);
+    [Future::Prior, Future::Held].into_iter().for_each(|future| check_gradient(None, future));
 }
 
-fn check_gradient(future: Future) {
-    let params = Params::fresh(2);
-    let model = model_of(future, &params);
+/// What the latent has to explain are the surprises themselves, so a baseline gets no gradient from there; all others do.
+#[test]
+fn gradient_beside_a_baseline() {
+    [Future::Prior, Future::Held].into_iter().for_each(|future| check_gradient(Some(Baseline { width: 5 }), future));
+}
+
+fn check_gradient(baseline: Option<Baseline>, future: Future) {
+    // Another seed beside a baseline, whose numbers lie away from the kinks as well.
+    let params = Params::fresh(if baseline.is_some() { 5 } else { 2 });
+    let model = beside(baseline, future, &params);
     let grads = model.elbo(&batch(), &options()).unwrap().loss.backward().unwrap();
-    for (name, var) in params.vars() {
+    for (name, var) in params.vars().into_iter().filter(|(name, _)| !name.starts_with("baseline.")) {
         let mut stream = Philox::named(9, &name);
         let direction: Vec<f32> = (0..var.elem_count()).map(|_| stream.normal()).collect();
         let direction = Tensor::from_vec(direction, var.shape().clone(), &Device::Cpu).unwrap();
@@ -158,4 +176,52 @@ fn a_held_belief_does_not_see_what_it_explains() {
     moved.tokens.state = last(&moved.tokens.state, 1);
     let (clean, moved) = (terms(&clean), terms(&moved));
     assert!(clean[0] == moved[0] && (clean[1] - moved[1]).abs() > 0.01, "{clean:?} {moved:?}");
+}
+
+/// Without surprises (they are worth nothing, as units of infinity) nothing but the KL is left, and each weight counts its own part.
+#[test]
+fn each_part_has_its_weight() {
+    let params = Params::fresh(2);
+    let model = beside(Some(Baseline { width: 5 }), Future::Prior, &params);
+    let terms = |change: &dyn Fn(&mut ElboOptions)| {
+        let mut options = ElboOptions { state_weight: 0.0, reward_weight: 0.0, action_weight: 0.0, kl_weight: 0.0, ..options() };
+        change(&mut options);
+        let terms = model.elbo(&batch(), &options).unwrap();
+        let number = |tensor: &Tensor| f64::from(tensor.to_scalar::<f32>().unwrap());
+        let action = number(terms.action_error.as_ref().unwrap());
+        (number(&terms.loss), [number(&terms.state_error), number(&terms.reward_error), action, number(&terms.kl)])
+    };
+    let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-5 * b.abs().max(1.0), "{a} {b}");
+    let (loss, [state, reward, action, kl]) = terms(&|_| ());
+    close(loss, 0.0);
+    close(terms(&|options| options.state_weight = 2.0).0, 2.0 * state * 3.0 / 2.0);
+    close(terms(&|options| options.reward_weight = 2.0).0, 2.0 * reward / 2.0);
+    close(terms(&|options| options.action_weight = 2.0).0, 2.0 * action * 2.0 / 2.0);
+    close(terms(&|options| options.kl_weight = 2.0).0, 2.0 * kl);
+    close(terms(&|options| (options.kl_weight, options.free_bits) = (1.0, 1e6)).0, 1e6);
+}
+
+/// How far a token is from what was expected, written out token by token; where it cannot be told, the encoder is shown a vector of its own.
+#[test]
+fn surprises_by_hand() {
+    let params = Params::fresh(2);
+    let model = beside(Some(Baseline { width: 5 }), Future::Prior, &params);
+    params.vars()["baseline.surprise.state.scale"].set(&Tensor::new(&[0.5f32, 2.0, 1.0], &Device::Cpu).unwrap()).unwrap();
+    let (tokens, baseline) = (batch().tokens, model.baseline.as_ref().unwrap());
+    let followed = tokens.clone().following(None).unwrap();
+    let surprises = baseline.surprises(&followed).unwrap();
+    for t in 1..LEN {
+        let [change, ..] = baseline.residuals(&tokens.narrow(t - 1, 2).unwrap()).unwrap();
+        let expected = change.broadcast_mul(&Tensor::new(&[0.5f32, 2.0, 1.0], &Device::Cpu).unwrap()).unwrap();
+        let error = (surprises.state.narrow(1, t, 1).unwrap() - expected.clamp(-10.0, 10.0).unwrap()).unwrap();
+        assert!(error.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-5);
+    }
+    // Row 1 begins before its episode: two absent tokens; nothing is told of them, nor of the arrival at the first real one.
+    let told = followed.before.unwrap().told.get(1).unwrap().to_vec2::<f32>().unwrap();
+    assert_eq!(told, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]);
+    // Looked at from the middle on, with the token in front, the rest is the same.
+    let rest = tokens.narrow(2, 3).unwrap().following(Some(&tokens.at(&[Some(1); BATCH]).unwrap())).unwrap();
+    let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert_eq!(flat(&baseline.surprises(&rest).unwrap().state), flat(&surprises.state.narrow(1, 2, 3).unwrap().contiguous().unwrap()));
+    assert!(baseline.surprises(&tokens).is_err(), "nobody said what came before");
 }

@@ -1,6 +1,6 @@
 //! Tokens to posterior: embeddings, GRU and Gaussian head (appendix A.4 of the paper: Stage 1 networks).
 
-use super::{Gaussian, Tokens};
+use super::{Before, Gaussian, Surprises, Tokens, gaussian::LOG_VAR};
 use crate::model::{
     method::GruLatent,
     nn::{
@@ -17,8 +17,6 @@ const STATE_WIDTH: usize = 32;
 const ACTION_WIDTH: usize = 16;
 const REWARD_WIDTH: usize = 16;
 const TOKEN_WIDTH: usize = 64;
-/// Bounds of a latent's log-variance.
-pub(super) const LOG_VAR: (f32, f32) = (-8.0, 2.0);
 
 /// One part of a token: a ReLU layer where present, a learned vector where absent.
 struct Part {
@@ -42,6 +40,8 @@ pub struct Encoder {
     state: Part,
     action: Part,
     reward: Part,
+    /// Of surprises in state, action and reward, beside a baseline.
+    surprise: Option<[Part; 3]>,
     mlp: [Linear; 2],
     gru: Gru,
     mean: Linear,
@@ -50,11 +50,21 @@ pub struct Encoder {
 
 impl Encoder {
     pub(super) fn new(config: &GruLatent, layout: Layout, params: &Params) -> Result<Self> {
-        let width = STATE_WIDTH + ACTION_WIDTH + REWARD_WIDTH + 1;
+        let parts = |params: &Params| -> Result<[Part; 3]> {
+            Ok([
+                Part::new(layout.state_dim, STATE_WIDTH, &params.scope("state"))?,
+                Part::new(layout.action_dim, ACTION_WIDTH, &params.scope("action"))?,
+                Part::new(1, REWARD_WIDTH, &params.scope("reward"))?,
+            ])
+        };
+        let surprise = config.baseline.map(|_| parts(&params.scope("surprise"))).transpose()?;
+        let width = (1 + usize::from(surprise.is_some())) * (STATE_WIDTH + ACTION_WIDTH + REWARD_WIDTH) + 1;
+        let [state, action, reward] = parts(params)?;
         Ok(Self {
-            state: Part::new(layout.state_dim, STATE_WIDTH, &params.scope("state"))?,
-            action: Part::new(layout.action_dim, ACTION_WIDTH, &params.scope("action"))?,
-            reward: Part::new(1, REWARD_WIDTH, &params.scope("reward"))?,
+            state,
+            action,
+            reward,
+            surprise,
             mlp: [Linear::new(width, TOKEN_WIDTH, &params.scope("mlp.0"))?, Linear::new(TOKEN_WIDTH, TOKEN_WIDTH, &params.scope("mlp.2"))?],
             gru: Gru::new(TOKEN_WIDTH, config.hidden, &params.scope("gru"))?,
             mean: Linear::new(config.hidden, config.dim, &params.scope("mean"))?,
@@ -62,12 +72,12 @@ impl Encoder {
         })
     }
 
-    /// GRU states after each token: `(B, L)` tokens to `(B, L, hidden)`; `before` is the state before the first, zero if none.
+    /// GRU states after each token, beside a baseline with its surprises: `(B, L)` tokens to `(B, L, hidden)`; `before` is the state before the first, zero if none.
     ///
     /// # Errors
     /// If widths differ from the layout.
-    pub fn states<V: Value>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
-        self.gru.forward(&self.embed(tokens)?, before)
+    pub fn states<V: Value>(&self, tokens: &Tokens<V>, surprises: Option<&Surprises<V>>, before: Option<&V>) -> Result<V> {
+        self.gru.forward(&self.embed(tokens, surprises)?, before)
     }
 
     /// Posterior from GRU states `(.., hidden)`.
@@ -79,12 +89,24 @@ impl Encoder {
         Ok(Gaussian { mean: self.mean.forward(states)?, log_var })
     }
 
-    fn embed<V: Value>(&self, tokens: &Tokens<V>) -> Result<V> {
+    fn embed<V: Value>(&self, tokens: &Tokens<V>, surprises: Option<&Surprises<V>>) -> Result<V> {
         let part = |part: &Part, value, index| part.forward(value, &tokens.present.channels(index, 1)?);
         let [state, action, reward] =
             [part(&self.state, &tokens.state, 0)?, part(&self.action, &tokens.action, 1)?, part(&self.reward, &tokens.reward, 2)?];
-        let x = V::beside(&[&state, &action, &reward, &tokens.noise])?;
+        let x = match (&self.surprise, surprises, &tokens.before) {
+            (Some(parts), Some(surprises), Some(before)) => {
+                let [to_state, to_action, to_reward] = surprised(parts, surprises, before)?;
+                V::beside(&[&state, &action, &reward, &to_state, &to_action, &to_reward, &tokens.noise])?
+            }
+            _ => V::beside(&[&state, &action, &reward, &tokens.noise])?,
+        };
         let x = self.mlp[0].forward(&x)?.activated(Relu)?;
         self.mlp[1].forward(&x)?.activated(Relu)
     }
+}
+
+/// Embeddings of surprises where they are told.
+fn surprised<V: Value>(parts: &[Part; 3], surprises: &Surprises<V>, before: &Before<V>) -> Result<[V; 3]> {
+    let part = |index: usize, value: &V| parts[index].forward(value, &before.told.channels(index, 1)?);
+    Ok([part(0, &surprises.state)?, part(1, &surprises.action)?, part(2, &surprises.reward)?])
 }

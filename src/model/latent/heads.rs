@@ -1,29 +1,14 @@
 //! Prior and decoder (appendix A.4 of the paper: 2-layer MLPs).
 
-use super::{Gaussian, encoder::LOG_VAR};
+use super::{Gaussian, gaussian::LOG_VAR, mlp::Mlp};
 use crate::model::{
-    nn::{Activation::Relu, Linear, Value, params::Params},
+    nn::{Value, params::Params},
     trajectory::Layout,
 };
 use candle_core::Result;
 
 const PRIOR_WIDTH: usize = 32;
 const DECODER_WIDTH: usize = 64;
-
-/// Two hidden ReLU layers and a linear one.
-struct Mlp([Linear; 3]);
-
-impl Mlp {
-    fn new(d_in: usize, hidden: usize, d_out: usize, params: &Params) -> Result<Self> {
-        let layer = |i: usize, a, b| Linear::new(a, b, &params.scope(2 * i));
-        Ok(Self([layer(0, d_in, hidden)?, layer(1, hidden, hidden)?, layer(2, hidden, d_out)?]))
-    }
-
-    fn forward<V: Value>(&self, x: &V) -> Result<V> {
-        let x = self.0[0].forward(x)?.activated(Relu)?;
-        self.0[2].forward(&self.0[1].forward(&x)?.activated(Relu)?)
-    }
-}
 
 /// p(c_t given the distribution of c_{t-1}).
 pub struct Prior {
@@ -48,27 +33,43 @@ impl Prior {
     }
 }
 
-/// p(s_{t+1}, r_t given s_t, a_t, c_t): state change (in units of its standard deviation) and reward.
+/// p(s_{t+1}, r_t given s_t, a_t, c_t): state change (in units of its standard deviation) and reward; beside a baseline their surprises, and
+/// that of p(a_t given s_t, c_t): the context moves an expert's action too (section 3 of the paper, the edge from c to a).
 pub struct Decoder {
     state: Mlp,
     reward: Mlp,
+    action: Option<Mlp>,
+}
+
+/// What a latent says of a step.
+pub struct Told<V> {
+    /// `(.., state_dim)`.
+    pub state: V,
+    /// `(.., 1)`.
+    pub reward: V,
+    /// `(.., action_dim)`, beside a baseline.
+    pub action: Option<V>,
 }
 
 impl Decoder {
-    pub(super) fn new(dim: usize, layout: Layout, params: &Params) -> Result<Self> {
+    pub(super) fn new(dim: usize, layout: Layout, acts: bool, params: &Params) -> Result<Self> {
         let d_in = layout.dim() + dim;
+        let action = || Mlp::new(layout.state_dim + dim, DECODER_WIDTH, layout.action_dim, &params.scope("action"));
         Ok(Self {
             state: Mlp::new(d_in, DECODER_WIDTH, layout.state_dim, &params.scope("state"))?,
             reward: Mlp::new(d_in, DECODER_WIDTH, 1, &params.scope("reward"))?,
+            action: acts.then(action).transpose()?,
         })
     }
 
-    /// `(.., state_dim)`, `(.., action_dim)`, `(.., dim)` to state change `(.., state_dim)` and reward `(.., 1)`.
+    /// From `(.., state_dim)`, `(.., action_dim)`, `(.., dim)`; of the action only what needs to be known is looked at.
     ///
     /// # Errors
     /// If widths differ.
-    pub fn predict<V: Value>(&self, state: &V, action: &V, latent: &V) -> Result<(V, V)> {
+    pub fn predict<V: Value>(&self, state: &V, action: &V, latent: &V) -> Result<Told<V>> {
         let x = V::beside(&[state, action, latent])?;
-        Ok((self.state.forward(&x)?, self.reward.forward(&x)?))
+        let of_action = |network: &Mlp| network.forward(&V::beside(&[state, latent])?);
+        let action = self.action.as_ref().map(of_action).transpose()?;
+        Ok(Told { state: self.state.forward(&x)?, reward: self.reward.forward(&x)?, action })
     }
 }

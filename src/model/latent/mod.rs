@@ -1,16 +1,19 @@
 //! Stage 1: what cannot be seen, inferred from a block of tokens (section 4.2 of the paper).
+mod baseline;
 pub mod elbo;
 mod encoder;
 mod evidence;
 mod gaussian;
 mod heads;
+mod mlp;
 mod tokens;
 
+pub use baseline::{Baseline, ContextFreeTerms, SCALES, Surprises};
 pub use encoder::Encoder;
 pub use evidence::Evidence;
 pub use gaussian::{Gaussian, GaussianRef, hold_within};
-pub use heads::{Decoder, Prior};
-pub use tokens::Tokens;
+pub use heads::{Decoder, Prior, Told};
+pub use tokens::{Before, Tokens};
 
 use crate::model::{
     method::{Future, GruLatent},
@@ -24,6 +27,8 @@ use candle_core::{Result, Tensor};
 /// The posterior of c_t is read from the GRU after the token x_{t+1}; of that successor only what is known need be present, so
 /// the filter (successor state alone) and the refinement (noised state and action) are the same network.
 pub struct LatentModel {
+    /// What needs no context; none where the latent explains all.
+    pub baseline: Option<Baseline>,
     /// Tokens to posterior.
     pub encoder: Encoder,
     /// p(c_t given the distribution of c_{t-1}); none where the belief of now is held.
@@ -33,18 +38,20 @@ pub struct LatentModel {
 }
 
 impl LatentModel {
-    /// Networks under `params`' scope: `encoder.*`, `prior.*`, `decoder.*`.
+    /// Networks under `params`' scope: `baseline.*`, `encoder.*`, `prior.*`, `decoder.*`.
     ///
     /// # Errors
     /// If a loaded parameter is missing or of another shape.
     pub fn new(config: &GruLatent, layout: Layout, params: &Params) -> Result<Self> {
+        let baseline = config.baseline.map(|baseline| Baseline::new(baseline.width, layout, &params.scope("baseline")));
         Ok(Self {
+            baseline: baseline.transpose()?,
             encoder: Encoder::new(config, layout, &params.scope("encoder"))?,
             prior: match config.future {
                 Future::Prior => Some(Prior::new(config.dim, &params.scope("prior"))?),
                 Future::Held => None,
             },
-            decoder: Decoder::new(config.dim, layout, &params.scope("decoder"))?,
+            decoder: Decoder::new(config.dim, layout, config.baseline.is_some(), &params.scope("decoder"))?,
         })
     }
 
@@ -64,8 +71,12 @@ impl LatentModel {
     /// As [`Self::infer`].
     pub fn infer_behind(&self, history: &Tokens, lens: Option<&[usize]>, ahead: &Tokens) -> Result<Gaussian> {
         match lens {
-            None => self.infer(&history.concat(ahead)?, None),
-            Some(lens) => self.infer(ahead, Some(&self.read_to(history, lens)?)),
+            None => self.infer(&self.noticed(history.concat(ahead)?, None)?, None),
+            Some(lens) => {
+                let last: Vec<_> = lens.iter().map(|len| len.checked_sub(1)).collect();
+                let ahead = self.noticed(ahead.clone(), Some(&history.at(&last)?))?;
+                self.infer(&ahead, Some(&self.read_to(history, lens)?))
+            }
         }
     }
 
@@ -75,7 +86,18 @@ impl LatentModel {
     /// If widths differ from the layout, or there is no token.
     pub fn read<V: Value>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
         let (_, len) = tokens.batch_len()?;
-        self.encoder.states(tokens, before)?.step(len.saturating_sub(1))
+        self.states(tokens, before)?.step(len.saturating_sub(1))
+    }
+
+    /// States of the GRU after each token, `(B, L, hidden)`.
+    fn states<V: Value>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
+        let surprises = self.baseline.as_ref().map(|baseline| baseline.surprises(tokens)).transpose()?;
+        self.encoder.states(tokens, surprises.as_ref(), before)
+    }
+
+    /// Tokens with what came before each, if anybody looks at it; see [`Tokens::following`].
+    fn noticed(&self, tokens: Tokens, first: Option<&Tokens>) -> Result<Tokens> {
+        if self.baseline.is_some() { tokens.following(first) } else { Ok(tokens) }
     }
 
     /// State of the GRU after the first `lens[b]` tokens of row b, `(B, 1, hidden)`; zero after none.
@@ -84,7 +106,7 @@ impl LatentModel {
     /// As [`Self::read`].
     pub fn read_to(&self, tokens: &Tokens, lens: &[usize]) -> Result<Tensor> {
         let (batch, len) = tokens.batch_len()?;
-        let states = self.encoder.states(tokens, None)?;
+        let states = self.states(&self.noticed(tokens.clone(), None)?, None)?;
         let last: Vec<f32> = lens.iter().flat_map(|end| (1..=len).map(move |steps| f32::from(steps == *end))).collect();
         Tensor::from_vec(last, (batch, 1, len), states.device())?.matmul(&states)
     }

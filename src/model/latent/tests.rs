@@ -17,7 +17,8 @@ const LAYOUT: Layout = Layout { state_dim: 3, action_dim: 2 };
 const LEN: usize = 5;
 
 fn model() -> LatentModel {
-    let (config, fresh) = (GruLatent { dim: 6, hidden: 24, looks: Looks::Block(4), future: Future::Prior }, Params::fresh(4));
+    let (config, fresh) =
+        (GruLatent { dim: 6, hidden: 24, looks: Looks::Block(4), future: Future::Prior, baseline: None }, Params::fresh(4));
     LatentModel::new(&config, LAYOUT, &fresh).unwrap();
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
     LatentModel::new(&config, LAYOUT, &Params::loaded_as(tensors, Precision::F32)).unwrap()
@@ -37,7 +38,7 @@ fn rows() -> Vec<Vec<Token>> {
 
 /// Posterior, and mean and log-variance of the prior chain after it.
 fn chain<V: Value>(model: &LatentModel, rows: &[Vec<Token>], numbers: impl Fn(&V) -> Vec<f32>) -> Vec<u32> {
-    let tokens = Tokens::<V>::pack(LAYOUT, rows.iter(), LEN, |row, position| row[position].view()).unwrap();
+    let tokens = Tokens::<V>::pack(LAYOUT, rows.iter(), LEN, None, |row, position| row[position].view()).unwrap();
     let posterior = model.infer(&tokens, None).unwrap();
     let mut all = [numbers(&posterior.mean), numbers(&posterior.log_var)].concat();
     let keep = |next: &Gaussian<V>| {
@@ -71,14 +72,14 @@ fn a_row_does_not_depend_on_its_batch() {
 }
 
 fn golden_latent(dim: usize, hidden: usize) -> GruLatent {
-    GruLatent { dim, hidden, looks: Looks::Block(LEN), future: Future::Prior }
+    GruLatent { dim, hidden, looks: Looks::Block(LEN), future: Future::Prior, baseline: None }
 }
 
 /// Posteriors, the prior after the last of them, and what the decoder makes of their means: the results of the golden case, by name.
 fn everything<V: Value>(tokens: &Tokens<V>, params: &Params) -> candle_core::Result<Vec<(String, V)>> {
     let model = LatentModel::new(&golden_latent(3, 9), LAYOUT, params)?;
-    let posteriors = model.encoder.posterior(&model.encoder.states(tokens, None)?)?;
-    let (change, reward) = model.decoder.predict(&tokens.state, &tokens.action, &posteriors.mean)?;
+    let posteriors = model.encoder.posterior(&model.states(tokens, None)?)?;
+    let Told { state: change, reward, .. } = model.decoder.predict(&tokens.state, &tokens.action, &posteriors.mean)?;
     let mut named = vec![("change".into(), change), ("reward".into(), reward)];
     let mut tell = |name: &str, gaussian: &Gaussian<V>| {
         named.push((format!("mean{name}"), gaussian.mean.clone()));
@@ -104,7 +105,14 @@ fn networks_against_pytorch() {
 /// The ELBO and its gradients.
 #[test]
 fn elbo_against_pytorch() {
-    let options = ElboOptions { kl_weight: 0.3, state_change_std: vec![0.5, 1.0, 2.0], reward_weight: 0.7 };
+    let options = ElboOptions {
+        kl_weight: 0.3,
+        state_change_std: vec![0.5, 1.0, 2.0],
+        state_weight: 1.0,
+        reward_weight: 0.7,
+        action_weight: 0.6,
+        free_bits: 0.0,
+    };
     Golden::of("elbo").check_training(|given, params| {
         let [valid, history_shown, successor_shown, eps] =
             ["valid", "history_shown", "successor_shown", "eps"].map(|name| given[name].clone());
@@ -117,5 +125,5 @@ fn elbo_against_pytorch() {
 
 fn tokens_of<V>(value: impl Fn(&str) -> V) -> Tokens<V> {
     let [state, action, reward, present, noise] = ["state", "action", "reward", "present", "noise"].map(value);
-    Tokens { state, action, reward, present, noise }
+    Tokens { state, action, reward, present, noise, before: None }
 }

@@ -56,6 +56,7 @@ impl TokenRows {
             action: tensor(self.action, self.layout.action_dim)?,
             reward: tensor(self.reward, 1)?,
             present: tensor(self.present, 3)?,
+            before: None,
         })
     }
 }
@@ -92,7 +93,8 @@ impl Places {
         self.ends.last().is_none_or(|all| *all == 0)
     }
 
-    fn draw(&self, rng: &mut Philox) -> (usize, isize) {
+    /// One of them.
+    pub fn draw(&self, rng: &mut Philox) -> (usize, isize) {
         let drawn = rng.below(self.ends.last().copied().unwrap_or(0));
         let episode = self.ends.partition_point(|end| *end <= drawn);
         let first = episode.checked_sub(1).map_or(0, |before| self.ends[before]);

@@ -69,17 +69,21 @@ impl<'a> ElboLoss<'a> {
         let options = ElboOptions {
             kl_weight,
             state_change_std: self.task.config.units.normalizer.state_change_std.clone(),
+            state_weight: self.config.state_weight,
             reward_weight: self.config.reward_weight,
+            action_weight: self.config.action_weight.unwrap_or(0.0),
+            free_bits: self.config.free_bits,
         };
         let latent = networks.latent.as_ref().context("the ELBO needs a latent model: is a bug")?;
         let terms = latent.elbo(batch, &options)?;
         let mean = |name, tensor: &Tensor| -> Result<Mean> { Ok(Mean { name, sum: f64::from(tensor.to_scalar::<f32>()?), count: 1 }) };
-        let means = vec![
+        let mut means = vec![
             mean("elbo", &terms.loss)?,
             mean("state_error", &terms.state_error)?,
             mean("reward_error", &terms.reward_error)?,
             mean("kl", &terms.kl)?,
         ];
+        means.extend(terms.action_error.as_ref().map(|error| mean("action_error", error)).transpose()?);
         Ok((terms.loss, means))
     }
 

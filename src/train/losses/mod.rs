@@ -1,6 +1,7 @@
 //! A stage at work: the batches of its losses are drawn, their gradients computed side by side, and the optimizer makes one step on the
 //! weighted sum.
 
+pub mod context_free;
 pub mod denoise;
 pub mod elbo;
 
@@ -13,6 +14,7 @@ use super::{
 use crate::model::{Networks, noise::Philox};
 use anyhow::Result;
 use candle_core::backprop::GradStore;
+use context_free::ContextFreeLoss;
 use denoise::DenoiseLoss;
 use elbo::ElboLoss;
 
@@ -40,13 +42,19 @@ pub struct Objective<'a> {
     stage: &'a Stage,
     denoise: Option<DenoiseLoss<'a>>,
     elbo: Option<ElboLoss<'a>>,
+    context_free: Option<ContextFreeLoss<'a>>,
 }
 
 impl<'a> Objective<'a> {
     /// Of the stage with this index.
     pub fn new(task: &'a Task, stage: usize) -> Self {
-        let denoise = DenoiseLoss::of_stage(task, stage);
-        Self { task, stage: &task.recipe.stages[stage], denoise, elbo: ElboLoss::of_stage(task, stage) }
+        Self {
+            task,
+            stage: &task.recipe.stages[stage],
+            denoise: DenoiseLoss::of_stage(task, stage),
+            elbo: ElboLoss::of_stage(task, stage),
+            context_free: ContextFreeLoss::of_stage(task, stage),
+        }
     }
 
     /// One optimizer step, and one of the average.
@@ -79,6 +87,9 @@ impl<'a> Objective<'a> {
         if let Some(elbo) = &self.elbo {
             jobs.push(elbo.job(networks, step, rng)?);
         }
+        if let Some(context_free) = &self.context_free {
+            jobs.push(context_free.job(networks, rng)?);
+        }
         Ok(jobs)
     }
 
@@ -94,6 +105,9 @@ impl<'a> Objective<'a> {
         }
         if let Some(loss) = self.elbo.as_ref().map(|elbo| elbo.held_out(networks)).transpose()?.flatten() {
             scalars.push(("held_out_elbo", loss));
+        }
+        if let Some(context_free) = &self.context_free {
+            scalars.push(("held_out_context_free", context_free.held_out(networks)?));
         }
         Ok(scalars)
     }

@@ -23,6 +23,8 @@ pub enum Loss {
     Denoise,
     /// [`ElboConfig`].
     Elbo,
+    /// [`ContextFreeConfig`].
+    ContextFree,
 }
 
 impl Loss {
@@ -31,6 +33,7 @@ impl Loss {
         match self {
             Self::Denoise => "denoise",
             Self::Elbo => "elbo",
+            Self::ContextFree => "context_free",
         }
     }
 }
@@ -39,10 +42,20 @@ impl Loss {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Losses {
+    /// What needs no context; absent for models without a baseline.
+    pub context_free: Option<ContextFreeConfig>,
     /// What cannot be seen; absent for models without latents.
     pub elbo: Option<ElboConfig>,
     /// Denoise and refine.
     pub denoise: DenoiseConfig,
+}
+
+/// Squared errors of the models that know no context ([`crate::model::method::Baseline`]).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ContextFreeConfig {
+    /// Transitions in a batch.
+    pub batch: usize,
 }
 
 /// The evidence lower bound of what the latent explains (section 4.2 of the paper).
@@ -55,8 +68,16 @@ pub struct ElboConfig {
     pub length: usize,
     /// Weight of the KL term; its warm-up counts the steps of all stages that minimize the ELBO.
     pub kl_weight: Ramp,
-    /// Weight of the reward against one state column.
+    /// Weight of the state's error.
+    #[serde(default = "one")]
+    pub state_weight: f64,
+    /// Weight of the reward's error; of a model without a baseline, against the mean over the state's columns.
     pub reward_weight: f64,
+    /// Weight of the action's error, of models with a baseline: the context moves an expert's action too (section 3 of the paper).
+    pub action_weight: Option<f64>,
+    /// Nats of a step's KL that cost nothing.
+    #[serde(default)]
+    pub free_bits: f64,
     /// Probability that the posterior sees the successor's action.
     pub show_action: f32,
     /// Probability that it sees the successor's reward, given the action.
@@ -71,8 +92,15 @@ impl ElboConfig {
         between("losses.elbo.show_reward", self.show_reward, 0.0..=1.0)?;
         between("losses.elbo.kl_weight.start", self.kl_weight.start, WEIGHTS)?;
         between("losses.elbo.kl_weight.end", self.kl_weight.end, WEIGHTS)?;
-        between("losses.elbo.reward_weight", self.reward_weight, WEIGHTS)
+        between("losses.elbo.state_weight", self.state_weight, WEIGHTS)?;
+        between("losses.elbo.reward_weight", self.reward_weight, WEIGHTS)?;
+        between("losses.elbo.action_weight", self.action_weight.unwrap_or(0.0), WEIGHTS)?;
+        between("losses.elbo.free_bits", self.free_bits, WEIGHTS)
     }
+}
+
+fn one() -> f64 {
+    1.0
 }
 
 /// A value that grows on a line and then stays.
@@ -135,7 +163,26 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
         (None, Some(_)) => require(false, "losses.elbo", "needs model.latent")?,
     }
     require(recipe.losses.elbo.is_none() || used(Loss::Elbo), "losses.elbo", "is minimized by no stage")?;
+    check_baseline(recipe)?;
     check_denoise(recipe)
+}
+
+/// A baseline is what the surprises of all later stages are measured by, so it comes first.
+fn check_baseline(recipe: &Recipe) -> Result<(), RecipeError> {
+    let action = recipe.losses.elbo.as_ref().and_then(|elbo| elbo.action_weight);
+    match (recipe.model.latent.baseline(), &recipe.losses.context_free) {
+        (None, None) => return require(action.is_none(), "losses.elbo.action_weight", "needs model.latent.baseline"),
+        (None, Some(_)) => return require(false, "losses.context_free", "needs model.latent.baseline"),
+        (Some(_), None) => return require(false, "losses.context_free", "is missing, but model.latent.baseline asks for it"),
+        (Some(_), Some(loss)) => between("losses.context_free.batch", loss.batch, 1..=BATCH_MAX)?,
+    }
+    require(action.is_some(), "losses.elbo.action_weight", "is missing; 0 leaves actions out of what the latent explains")?;
+    let first = recipe.stages.iter().take_while(|stage| stage.weight(Loss::Elbo) == 0.0 && stage.weight(Loss::Denoise) == 0.0);
+    let learned = first.clone().any(|stage| stage.weight(Loss::ContextFree) > 0.0);
+    require(learned, "stages", "must begin with one that minimizes context_free: later ones are told how far off the baseline is")?;
+    let again = recipe.stages[first.count()..].iter().find(|stage| stage.weight(Loss::ContextFree) > 0.0);
+    let key = again.map_or(String::new(), |stage| format!("stages.{}.minimizes.context_free", stage.name));
+    require(again.is_none(), key, "must not move the baseline when the latent has seen how far off it is")
 }
 
 fn check_denoise(recipe: &Recipe) -> Result<(), RecipeError> {

@@ -13,6 +13,8 @@ use std::collections::{BTreeMap, BTreeSet};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Group {
+    /// Models without a context, a part of the latent's.
+    Baseline,
     /// Encoder, prior and decoders of what cannot be seen.
     Latent,
     /// The planner.
@@ -21,27 +23,38 @@ pub enum Group {
 
 impl Group {
     /// All of them.
-    pub const ALL: [Self; 2] = [Self::Latent, Self::Denoiser];
+    pub const ALL: [Self; 3] = [Self::Baseline, Self::Latent, Self::Denoiser];
 
-    /// As recipes and checkpoints spell it.
+    /// As recipes spell it.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Baseline => "baseline",
             Self::Latent => "latent",
             Self::Denoiser => "denoiser",
         }
     }
 
-    /// The group of a variable.
+    /// How names of its variables begin.
+    pub fn prefix(self) -> &'static str {
+        match self {
+            Self::Baseline => "latent.baseline.",
+            Self::Latent => "latent.",
+            Self::Denoiser => "denoiser.",
+        }
+    }
+
+    /// The group of a variable: that with the longest prefix.
     pub fn of(variable: &str) -> Option<Self> {
-        let (first, _) = variable.split_once('.')?;
-        Self::ALL.into_iter().find(|group| group.name() == first)
+        Self::ALL.into_iter().find(|group| variable.starts_with(group.prefix()))
     }
 
     /// Whether the gradient of a loss comes to it.
     fn is_reached_by(self, loss: Loss) -> bool {
         match (self, loss) {
-            (Self::Latent, Loss::Elbo | Loss::Denoise) | (Self::Denoiser, Loss::Denoise) => true,
-            (Self::Denoiser, Loss::Elbo) => false,
+            (Self::Baseline, Loss::ContextFree) | (Self::Latent, Loss::Elbo | Loss::Denoise) | (Self::Denoiser, Loss::Denoise) => true,
+            // How far off it is, is a fact for all that come after it.
+            (Self::Baseline, Loss::Elbo | Loss::Denoise) => false,
+            (Self::Latent | Self::Denoiser, Loss::ContextFree) | (Self::Denoiser, Loss::Elbo) => false,
         }
     }
 }
@@ -83,13 +96,21 @@ impl Stage {
         let key = |field: &str| format!("stages.{}.{field}", self.name);
         for (loss, weight) in &self.minimizes {
             between(key(&format!("minimizes.{}", loss.name())), *weight, WEIGHTS)?;
-            let there = *weight == 0.0 || *loss != Loss::Elbo || recipe.losses.elbo.is_some();
-            require(there, key("minimizes.elbo"), "needs [losses.elbo]")?;
+            let there = match loss {
+                Loss::Denoise => true,
+                Loss::Elbo => recipe.losses.elbo.is_some(),
+                Loss::ContextFree => recipe.losses.context_free.is_some(),
+            };
+            require(*weight == 0.0 || there, key(&format!("minimizes.{}", loss.name())), format!("needs [losses.{}]", loss.name()))?;
         }
         for (group, factor) in &self.trains {
             let key = key(&format!("trains.{}", group.name()));
             between(&key, *factor, WEIGHTS)?;
-            require(*group != Group::Latent || recipe.model.latent.gru().is_some(), &key, "needs model.latent")?;
+            match group {
+                Group::Denoiser => {}
+                Group::Latent => require(recipe.model.latent.gru().is_some(), &key, "needs model.latent")?,
+                Group::Baseline => require(recipe.model.latent.baseline().is_some(), &key, "needs model.latent.baseline")?,
+            }
             let reached = self.minimizes.iter().any(|(loss, weight)| *weight > 0.0 && group.is_reached_by(*loss));
             require(reached, &key, "is not reached by any loss that this stage minimizes")?;
         }

@@ -104,7 +104,8 @@ async fn broken_models_cost_themselves() {
     let absurd: [(&str, Change); 6] = [
         ("levels", |config| config.method.plan.level_max = 1_000_000_000_000),
         ("block", |config| {
-            config.method.latent = LatentSource::Gru(GruLatent { dim: 6, hidden: 32, looks: Looks::Block(1 << 62), future: Future::Prior })
+            config.method.latent =
+                LatentSource::Gru(GruLatent { dim: 6, hidden: 32, looks: Looks::Block(1 << 62), future: Future::Prior, baseline: None })
         }),
         ("horizon", |config| config.method.plan.horizon = usize::MAX / 2),
         ("sub-steps", |config| config.defaults.sampler.sub_steps = (1 << 61) + 1),

@@ -1,11 +1,15 @@
 //! A GRU that runs on over the episode: its state is the episode's memory.
 
 use super::*;
-use crate::model::method::LatentSource;
+use crate::model::method::{Baseline, LatentSource};
 
 fn running() -> Agent {
+    running_beside(None, Future::Held)
+}
+
+fn running_beside(baseline: Option<Baseline>, future: Future) -> Agent {
     let mut config = agent(true, 1, unet()).config.clone();
-    config.method.latent = LatentSource::Gru(GruLatent { dim: 5, hidden: 16, looks: Looks::Running, future: Future::Held });
+    config.method.latent = LatentSource::Gru(GruLatent { dim: 5, hidden: 16, looks: Looks::Running, future, baseline });
     config.trained.refined = false;
     config.defaults.sampler.kappa = 0.0;
     config.check().unwrap();
@@ -28,7 +32,11 @@ fn told(steps: std::ops::Range<usize>) -> Observation {
 /// Told in one act or step by step, the same past leaves the same memory, and no more tokens than the denoiser looks back on.
 #[test]
 fn a_past_is_read_once() {
-    let agent = running();
+    check_a_past_is_read_once(&running());
+    check_a_past_is_read_once(&running_beside(Some(Baseline { width: 6 }), Future::Prior));
+}
+
+fn check_a_past_is_read_once(agent: &Agent) {
     let fresh = agent.open(1, &options()).unwrap();
     let at_once = agent.act(&fresh, &told(0..30)).unwrap();
     let mut lived = agent.act(&fresh, &told(0..1)).unwrap();
@@ -60,7 +68,11 @@ fn a_batch_reads_what_each_row_has() {
 /// A context that outlasts episodes is remembered over a reset, and only if that is asked for.
 #[test]
 fn a_reset_keeps_the_memory_if_asked() {
-    let agent = running();
+    check_a_reset_keeps_the_memory(&running());
+    check_a_reset_keeps_the_memory(&running_beside(Some(Baseline { width: 6 }), Future::Held));
+}
+
+fn check_a_reset_keeps_the_memory(agent: &Agent) {
     let (episode, _) = agent.act(&agent.open(1, &options()).unwrap(), &told(0..4)).unwrap();
     let latent = |keep| agent.act(&agent.reset(&episode, 1, keep), &told(0..0)).unwrap().1.latent_mean;
     assert_ne!(latent(true), latent(false));
@@ -69,9 +81,11 @@ fn a_reset_keeps_the_memory_if_asked() {
 
 /// What it would need to wait for, or to leave for the next act, it does not have.
 #[test]
-fn a_running_posterior_is_refused() {
+fn what_a_method_does_not_have_is_refused() {
     let mut config = running().config.clone();
-    config.method.latent = LatentSource::Gru(GruLatent { dim: 5, hidden: 16, looks: Looks::Running, future: Future::Prior });
+    config.method.latent =
+        LatentSource::Gru(GruLatent { dim: 5, hidden: 16, looks: Looks::Running, future: Future::Prior, baseline: None });
+    (config.trained.refined, config.trained.action_horizons) = (true, vec![1, 2]);
     assert_eq!(config.check().unwrap_err().field, "method.latent.looks");
     let uniform = Schedule::Uniform { steps: 5 };
     let mut config = agent(false, 1, unet()).config.clone();

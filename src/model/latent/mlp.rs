@@ -1,0 +1,19 @@
+//! The networks of everything small.
+
+use crate::model::nn::{Activation::Relu, Linear, Value, params::Params};
+use candle_core::Result;
+
+/// Two hidden ReLU layers and a linear one.
+pub(super) struct Mlp([Linear; 3]);
+
+impl Mlp {
+    pub(super) fn new(d_in: usize, hidden: usize, d_out: usize, params: &Params) -> Result<Self> {
+        let layer = |i: usize, a, b| Linear::new(a, b, &params.scope(2 * i));
+        Ok(Self([layer(0, d_in, hidden)?, layer(1, hidden, hidden)?, layer(2, hidden, d_out)?]))
+    }
+
+    pub(super) fn forward<V: Value>(&self, x: &V) -> Result<V> {
+        let x = self.0[0].forward(x)?.activated(Relu)?;
+        self.0[2].forward(&self.0[1].forward(&x)?.activated(Relu)?)
+    }
+}

@@ -1,0 +1,109 @@
+//! The errors of models that know no context on drawn transitions, and their size on held-out ones.
+
+use super::{Job, Mean, Part};
+use crate::model::{
+    Networks,
+    latent::{Baseline, SCALES, Tokens},
+    noise::Philox,
+    trajectory::Seen,
+};
+use crate::train::{
+    Task,
+    dataset::{
+        Episode,
+        window::{Places, TokenRows},
+    },
+    probe::places,
+    recipe::losses::Loss,
+};
+use anyhow::{Context, Result};
+use candle_core::{Tensor, Var};
+use std::collections::BTreeMap;
+
+/// Held-out transitions over which surprises are measured.
+const HELD_OUT_ROWS: usize = 20_000;
+/// Least standard deviation of a surprise: that of a state column in units of its change, that of the others in those of the data. What a
+/// baseline knows exactly is not to be looked at through a microscope.
+const FLOOR: f32 = 0.02;
+
+/// Draws transitions and evaluates the loss.
+pub struct ContextFreeLoss<'a> {
+    task: &'a Task,
+    /// In the sum that the stage minimizes.
+    weight: f64,
+    batch: usize,
+    places: Places,
+}
+
+impl<'a> ContextFreeLoss<'a> {
+    /// As the stage with this index has it; none where it does not.
+    pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
+        let weight = task.recipe.stages.get(stage)?.weight(Loss::ContextFree);
+        let config = task.recipe.losses.context_free.as_ref().filter(|_| weight > 0.0)?;
+        Some(Self { task, weight, batch: config.batch, places: Places::new(&task.split.train, 0, 2) })
+    }
+
+    /// Draws the batch of a step.
+    ///
+    /// # Errors
+    /// If an episode cannot be read.
+    pub(super) fn job<'b>(&'b self, networks: &'b Networks, rng: &mut Philox) -> Result<Job<'b>> {
+        let drawn: Vec<(usize, usize)> =
+            (0..self.batch).map(|_| self.places.draw(rng)).map(|(episode, t)| (episode, t.unsigned_abs())).collect();
+        let batch = transitions(&self.task.split.train, &drawn)?;
+        Ok(Box::new(move || {
+            let terms = baseline(networks)?.loss(&batch, &self.task.config.units.normalizer.state_change_std)?;
+            let mean = |name, tensor: &Tensor| -> Result<Mean> { Ok(Mean { name, sum: f64::from(tensor.to_scalar::<f32>()?), count: 1 }) };
+            let means = vec![
+                mean("context_free", &terms.loss)?,
+                mean("state_error", &terms.state_error)?,
+                mean("action_error", &terms.action_error)?,
+                mean("reward_error", &terms.reward_error)?,
+            ];
+            Ok(Part { grads: terms.loss.affine(self.weight, 0.0)?.backward()?, means })
+        }))
+    }
+
+    /// The loss on held-out transitions.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn held_out(&self, networks: &Networks) -> Result<f64> {
+        let episodes = &self.task.split.held_out;
+        let batch = transitions(episodes, &places(episodes, HELD_OUT_ROWS))?;
+        let terms = baseline(networks)?.loss(&batch, &self.task.config.units.normalizer.state_change_std)?;
+        Ok(f64::from(terms.loss.to_scalar::<f32>()?))
+    }
+}
+
+/// Measures on held-out transitions how far off the baseline is, and makes that the unit of surprises.
+///
+/// # Errors
+/// If a tensor operation fails.
+pub fn measure_surprises(task: &Task, networks: &Networks, vars: &BTreeMap<String, Var>) -> Result<()> {
+    let episodes = &task.split.held_out;
+    let residuals = baseline(networks)?.residuals(&transitions(episodes, &places(episodes, HELD_OUT_ROWS))?)?;
+    let change = &task.config.units.normalizer.state_change_std;
+    for (index, (residual, name)) in residuals.iter().zip(SCALES).enumerate() {
+        let variance = residual.sqr()?.mean((0, 1))?.to_vec1::<f32>()?;
+        let floor = |column: usize| if index == 0 { FLOOR * change[column] } else { FLOOR };
+        let scale = variance.iter().enumerate().map(|(column, variance)| 1.0 / variance.sqrt().max(floor(column)).max(f32::MIN_POSITIVE));
+        let scale = Tensor::from_iter(scale, residual.device())?;
+        let name = format!("latent.baseline.{name}");
+        vars.get(&name).with_context(|| format!("no variable {name}: is a bug"))?.set(&scale)?;
+    }
+    Ok(())
+}
+
+fn baseline(networks: &Networks) -> Result<&Baseline> {
+    networks.latent.as_ref().and_then(|latent| latent.baseline.as_ref()).context("no baseline to train: is a bug")
+}
+
+/// Tokens at these places and one later.
+fn transitions(episodes: &[Episode], places: &[(usize, usize)]) -> Result<Tokens> {
+    let mut rows = TokenRows::new(episodes[0].layout);
+    for (episode, t) in places {
+        (*t..t + 2).try_for_each(|t| rows.push(&episodes[*episode], t as isize, Seen::ALL))?;
+    }
+    Ok(rows.tokens(places.len(), 2)?)
+}
