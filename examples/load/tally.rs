@@ -173,6 +173,7 @@ mod tests {
         tally.give_up(tally.window.end - 10 * SECOND);
         tally.give_up(tally.window.start);
         let counts = tally.counts();
-        assert_eq!((counts.unsent, counts.latency.count(), counts.latency.max_ms()), (1, 1, 10_000.0));
+        assert_eq!((counts.unsent, counts.latency.count()), (1, 1));
+        assert!((10_000.0..10_010.0).contains(&counts.latency.max_ms()));
     }
 }

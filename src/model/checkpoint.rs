@@ -14,7 +14,7 @@ use crate::model::{
 use candle_core::{Device, Tensor};
 use files::Files;
 use format1::ConfigV1;
-use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::{collections::BTreeMap, path::Path};
@@ -104,6 +104,12 @@ pub struct TensorDigest {
     pub sha256: String,
 }
 
+impl TensorDigest {
+    fn of(view: &TensorView) -> Self {
+        Self { shape: view.shape().to_vec(), sha256: sha256(view.data()) }
+    }
+}
+
 impl Manifest {
     /// The manifest in these bytes, read from `path`.
     fn parse(path: &Path, bytes: &[u8]) -> Result<Self, CheckpointError> {
@@ -159,7 +165,7 @@ fn first_act(agent: &Agent) -> Result<(), String> {
 
 fn encode(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>, provenance: &Provenance) -> Result<Files, CheckpointError> {
     let config = pretty(config, &dir.join(CONFIG))?;
-    let (weights, digests) = serialize_tensors(tensors).map_err(|reason| invalid(&dir.join(WEIGHTS), reason))?;
+    let (weights, digests) = serialize_tensors(tensors).map_err(|error| invalid(&dir.join(WEIGHTS), error.to_string()))?;
     let digest = |name: &str, bytes: &[u8]| (name.to_string(), sha256(bytes));
     let files = [digest(CONFIG, &config), digest(WEIGHTS, &weights)];
     let manifest = Manifest { format_version: FORMAT_VERSION, files: files.into(), tensors: digests, provenance: provenance.clone() };
@@ -233,18 +239,10 @@ pub fn load_manifest(dir: &Path) -> Result<(Manifest, String), CheckpointError> 
     Ok((Manifest::parse(&path, &bytes)?, sha256(&bytes)))
 }
 
-fn serialize_tensors(tensors: &BTreeMap<String, Tensor>) -> Result<(Vec<u8>, BTreeMap<String, TensorDigest>), String> {
-    let mut bytes: Vec<(String, Vec<usize>, Vec<u8>)> = Vec::new();
-    for (name, tensor) in tensors {
-        let values = tensor.flatten_all().and_then(|flat| flat.to_vec1::<f32>()).map_err(|error| format!("{name}: {error}"))?;
-        bytes.push((name.clone(), tensor.dims().to_vec(), values.iter().flat_map(|value| value.to_le_bytes()).collect()));
-    }
-    let digest =
-        |(name, shape, bytes): &(String, Vec<usize>, Vec<u8>)| (name.clone(), TensorDigest { shape: shape.clone(), sha256: sha256(bytes) });
-    let digests = bytes.iter().map(digest).collect();
-    let views = bytes.iter().map(|(name, shape, bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)));
-    let views = views.collect::<Result<Vec<_>, safetensors::SafeTensorError>>().map_err(|error| error.to_string())?;
-    Ok((safetensors::serialize(views, None).map_err(|error| error.to_string())?, digests))
+fn serialize_tensors(tensors: &BTreeMap<String, Tensor>) -> Result<(Vec<u8>, BTreeMap<String, TensorDigest>), SafeTensorError> {
+    let bytes = safetensors::serialize(tensors, None)?;
+    let digests = SafeTensors::deserialize(&bytes)?.tensors().into_iter().map(|(name, view)| (name, TensorDigest::of(&view))).collect();
+    Ok((bytes, digests))
 }
 
 fn read_tensors(bytes: &[u8], manifest: &Manifest) -> Result<BTreeMap<String, Tensor>, String> {
@@ -259,7 +257,7 @@ fn read_tensors(bytes: &[u8], manifest: &Manifest) -> Result<BTreeMap<String, Te
     let mut tensors = BTreeMap::new();
     for (name, view) in file.tensors() {
         let expected = manifest.tensors.get(&name).ok_or_else(|| format!("tensor {name} is not in the manifest"))?;
-        let found = TensorDigest { shape: view.shape().to_vec(), sha256: sha256(view.data()) };
+        let found = TensorDigest::of(&view);
         if view.dtype() != Dtype::F32 || found != *expected {
             return Err(format!(
                 "tensor {name} is {:?} {:?}, the manifest has F32 {:?} with another digest",

@@ -1,7 +1,8 @@
-//! TensorBoard event files: protocol buffers of a few fields, written by hand, in TFRecord frames with masked CRC-32C.
+//! TensorBoard event files: protocol buffers of a few fields in TFRecord frames with masked CRC-32C.
 //!
 //! Formats: tensorflow `core/util/event.proto`, `core/framework/summary.proto`, `core/lib/io/record_writer.cc`.
 
+use prost::Message;
 use std::{
     fs::{self, File},
     io::{self, Write},
@@ -11,77 +12,57 @@ use std::{
 /// What the name of an event file begins with.
 const NAME: &str = "events.out.tfevents.";
 
-/// CRC-32C (Castagnoli), reflected polynomial.
-const POLYNOMIAL: u32 = 0x82F6_3B78;
-const TABLE: [u32; 256] = table();
+/// iSCSI's checksum is CRC-32C.
+const CRC32C: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISCSI);
 
-const fn table() -> [u32; 256] {
-    let mut table = [0; 256];
-    let mut index = 0;
-    while index < 256 {
-        let (mut crc, mut bit) = (index as u32, 0);
-        while bit < 8 {
-            crc = if crc & 1 == 1 { (crc >> 1) ^ POLYNOMIAL } else { crc >> 1 };
-            bit += 1;
-        }
-        table[index] = crc;
-        index += 1;
-    }
-    table
+/// `tensorflow.Event`, as far as it is written. Its `oneof` looks on the wire like optional fields of which one is there.
+#[derive(Clone, PartialEq, Message)]
+struct Event {
+    /// Seconds since 1970.
+    #[prost(double, required, tag = "1")]
+    wall_time: f64,
+    #[prost(uint64, optional, tag = "2")]
+    step: Option<u64>,
+    #[prost(string, optional, tag = "3")]
+    file_version: Option<String>,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+    #[prost(message, optional, tag = "7")]
+    session_log: Option<SessionLog>,
 }
 
-fn crc32c(bytes: &[u8]) -> u32 {
-    !bytes.iter().fold(!0, |crc: u32, byte| (crc >> 8) ^ TABLE[((crc ^ u32::from(*byte)) & 0xFF) as usize])
+/// `tensorflow.Summary`.
+#[derive(Clone, PartialEq, Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    value: Vec<Scalar>,
+}
+
+/// `tensorflow.Summary.Value` with a `simple_value`.
+#[derive(Clone, PartialEq, Message)]
+struct Scalar {
+    #[prost(string, required, tag = "1")]
+    tag: String,
+    #[prost(float, required, tag = "2")]
+    simple_value: f32,
+}
+
+/// `tensorflow.SessionLog`; status 1: START.
+#[derive(Clone, PartialEq, Message)]
+struct SessionLog {
+    #[prost(int32, required, tag = "1")]
+    status: i32,
 }
 
 /// TFRecord stores checksums rotated and offset, so that a file of checksums still checks well.
 fn masked(bytes: &[u8]) -> [u8; 4] {
-    crc32c(bytes).rotate_right(15).wrapping_add(0xA282_EAD8).to_le_bytes()
+    CRC32C.checksum(bytes).rotate_right(15).wrapping_add(0xA282_EAD8).to_le_bytes()
 }
 
 /// Length, its checksum, the record, its checksum.
 fn frame(record: &[u8]) -> Vec<u8> {
     let length = (record.len() as u64).to_le_bytes();
     [&length[..], &masked(&length), record, &masked(record)].concat()
-}
-
-/// A protocol buffer message under construction.
-#[derive(Default)]
-struct Message(Vec<u8>);
-
-impl Message {
-    fn varint(&mut self, mut value: u64) {
-        while value >= 0x80 {
-            self.0.push(value as u8 | 0x80);
-            value >>= 7;
-        }
-        self.0.push(value as u8);
-    }
-
-    fn integer(mut self, field: u64, value: u64) -> Self {
-        self.varint(field << 3);
-        self.varint(value);
-        self
-    }
-
-    fn double(mut self, field: u64, value: f64) -> Self {
-        self.varint(field << 3 | 1);
-        self.0.extend(value.to_le_bytes());
-        self
-    }
-
-    fn float(mut self, field: u64, value: f32) -> Self {
-        self.varint(field << 3 | 5);
-        self.0.extend(value.to_le_bytes());
-        self
-    }
-
-    fn bytes(mut self, field: u64, value: &[u8]) -> Self {
-        self.varint(field << 3 | 2);
-        self.varint(value.len() as u64);
-        self.0.extend(value);
-        self
-    }
 }
 
 /// Microseconds in the name of an event file.
@@ -106,9 +87,9 @@ impl EventWriter {
         let newest = fs::read_dir(dir)?.filter_map(|entry| time_of(&entry.ok()?.file_name().to_string_lossy())).max();
         let micros = newest.map_or(0, |newest| newest + 1).max((seconds * 1e6) as u64);
         let mut writer = Self { file: File::create(dir.join(format!("{NAME}{:010}.{:06}.ada", micros / 1_000_000, micros % 1_000_000)))? };
-        writer.write(&Message::default().double(1, seconds).bytes(3, b"brain.Event:2"))?;
-        let start = Message::default().integer(1, 1);
-        writer.write(&Message::default().double(1, seconds).integer(2, done + 1).bytes(7, &start.0))?;
+        let event = Event { wall_time: seconds, ..Event::default() };
+        writer.write(&Event { file_version: Some("brain.Event:2".to_owned()), ..event.clone() })?;
+        writer.write(&Event { step: Some(done + 1), session_log: Some(SessionLog { status: 1 }), ..event })?;
         Ok(writer)
     }
 
@@ -117,15 +98,12 @@ impl EventWriter {
     /// # Errors
     /// If the file cannot be written.
     pub fn scalars<'a>(&mut self, step: u64, seconds: f64, values: impl Iterator<Item = (&'a str, f64)>) -> io::Result<()> {
-        let summary = values.fold(Message::default(), |summary, (tag, value)| {
-            let value = Message::default().bytes(1, tag.as_bytes()).float(2, value as f32);
-            summary.bytes(1, &value.0)
-        });
-        self.write(&Message::default().double(1, seconds).integer(2, step).bytes(5, &summary.0))
+        let value = values.map(|(tag, value)| Scalar { tag: tag.to_owned(), simple_value: value as f32 }).collect();
+        self.write(&Event { wall_time: seconds, step: Some(step), summary: Some(Summary { value }), ..Event::default() })
     }
 
-    fn write(&mut self, event: &Message) -> io::Result<()> {
-        self.file.write_all(&frame(&event.0))
+    fn write(&mut self, event: &Event) -> io::Result<()> {
+        self.file.write_all(&frame(&event.encode_to_vec()))
     }
 }
 
@@ -133,12 +111,10 @@ impl EventWriter {
 mod tests {
     use super::*;
 
-    /// The check value of CRC-32C (RFC 3720, B.4, and the catalogue of parametrised CRC algorithms).
+    /// CRC-32C of 32 zeros is 0x8A91_36AA (RFC 3720, B.4).
     #[test]
-    fn crc32c_known_answers() {
-        assert_eq!(crc32c(b"123456789"), 0xE306_9283);
-        assert_eq!(crc32c(&[0; 32]), 0x8A91_36AA);
-        assert_eq!(crc32c(&[0xFF; 32]), 0x62A8_AB43);
+    fn checksums_are_masked() {
+        assert_eq!(masked(&[0; 32]), 0x8A91_36AA_u32.rotate_right(15).wrapping_add(0xA282_EAD8).to_le_bytes());
     }
 
     /// The first frame of every TensorBoard file of version 2, as `tf.summary` writes it (wall time 0).

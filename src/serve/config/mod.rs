@@ -94,8 +94,6 @@ pub struct ConnectionConfig {
 pub struct LimitsConfig {
     /// Bytes of one message, of either face.
     pub message_bytes_max: usize,
-    /// Nesting of a JSON body.
-    pub json_depth_max: usize,
     /// Acts of one ActBatch.
     pub act_batch_len_max: usize,
     /// Steps that one act may be told of (`executed`); a model looks back on `block_len` of them at most.
@@ -234,7 +232,6 @@ impl Default for LimitsConfig {
     fn default() -> Self {
         Self {
             message_bytes_max: 1 << 20,
-            json_depth_max: 64,
             act_batch_len_max: 256,
             executed_len_max: 4096,
             stream_acts_max: 256,
@@ -391,7 +388,6 @@ impl Config {
         range("server.origins", self.server.origins.iter().all(is_origin), "must list origins without path, e.g. https://lab.example")?;
         range("connection.header_bytes_max", self.connection.header_bytes_max >= 8192, "must be at least 8192")?;
         range("sessions.ttl_ms", self.sessions.ttl_ms <= self.sessions.ttl_ms_max, "must be at most sessions.ttl_ms_max")?;
-        range("limits.json_depth_max", self.limits.json_depth_max <= 128, "must be at most 128")?;
         let deadlines = self.limits.act_deadline_ms <= self.limits.act_deadline_ms_max;
         let margin = self.engine.deadline_margin_ms < self.limits.act_deadline_ms;
         range("engine.deadline_margin_ms", margin, "must be below limits.act_deadline_ms")?;
@@ -400,7 +396,7 @@ impl Config {
     }
 
     /// Settings that make no sense as 0.
-    fn positive(&self) -> [(&'static str, u64); 30] {
+    fn positive(&self) -> [(&'static str, u64); 29] {
         let (connection, limits, sessions, engine) = (&self.connection, &self.limits, &self.sessions, &self.engine);
         [
             ("server.connections_max", self.server.connections_max as u64),
@@ -418,7 +414,6 @@ impl Config {
             ("connection.keepalive_interval_ms", connection.keepalive_interval_ms),
             ("connection.keepalive_timeout_ms", connection.keepalive_timeout_ms),
             ("limits.message_bytes_max", limits.message_bytes_max as u64),
-            ("limits.json_depth_max", limits.json_depth_max as u64),
             ("limits.act_batch_len_max", limits.act_batch_len_max as u64),
             ("limits.executed_len_max", limits.executed_len_max as u64),
             ("limits.stream_acts_max", limits.stream_acts_max as u64),

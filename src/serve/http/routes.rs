@@ -128,8 +128,7 @@ fn misread_query(rejection: &QueryRejection) -> ServiceError {
 }
 
 async fn read<T: DeserializeOwned>(body: Body, state: &State) -> Result<T, Problem> {
-    let config = state.service.config();
-    Ok(parse(&bytes(body, config).await?, config)?)
+    Ok(parse(&bytes(body, state.service.config()).await?)?)
 }
 
 /// OpenSession
@@ -168,9 +167,8 @@ async fn close_session(Shared(state): Shared<State>, Named(id): Named) -> Result
 #[utoipa::path(post, path = "/v1/sessions/{id}/reset", params(("id" = String, Path)), request_body = ResetBody,
     responses((status = 200, description = "The session", body = OneSession), Problem))]
 async fn reset_session(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Answer<OneSession> {
-    let config = state.service.config();
-    let bytes = bytes(body, config).await?;
-    let body: ResetBody = if bytes.is_empty() { ResetBody::default() } else { parse(&bytes, config)? };
+    let bytes = bytes(body, state.service.config()).await?;
+    let body: ResetBody = if bytes.is_empty() { ResetBody::default() } else { parse(&bytes)? };
     let session = state.service.reset(body.into_request(id))?;
     Ok(Json(OneSession { session: session.into() }))
 }

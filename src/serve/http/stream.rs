@@ -64,7 +64,7 @@ async fn talk(
 ) -> Option<Ending> {
     let left = CancellationToken::new();
     let leave = left.clone();
-    let acts = acts(messages, service.clone(), ear.clone()).chain(stream::poll_fn(move |_| {
+    let acts = acts(messages, ear.clone()).chain(stream::poll_fn(move |_| {
         leave.cancel();
         Poll::Ready(None)
     }));
@@ -161,7 +161,7 @@ impl Ear {
     }
 
     /// The act that this message is, if it is one.
-    fn act(&self, message: &Message, service: &Service) -> Option<Result<ActRequest, ActResult>> {
+    fn act(&self, message: &Message) -> Option<Result<ActRequest, ActResult>> {
         let bytes = match message {
             Message::Text(text) => text.as_bytes(),
             Message::Binary(bytes) => bytes,
@@ -169,7 +169,7 @@ impl Ear {
         };
         self.in_work.fetch_add(1, Ordering::Relaxed);
         let session_of = |named: Option<String>| named.unwrap_or_else(|| self.session_id.clone());
-        Some(match parse::<ActBody>(bytes, service.config()) {
+        Some(match parse::<ActBody>(bytes) {
             Ok(mut body) => {
                 let session_id = session_of(body.session_id.take());
                 Ok(body.into_request(session_id, self.client))
@@ -183,11 +183,7 @@ impl Ear {
 }
 
 /// The acts among the messages; they end with the client's close or a broken connection.
-fn acts(
-    messages: impl Stream<Item = Result<Message, axum::Error>>,
-    service: Arc<Service>,
-    ear: Arc<Ear>,
-) -> impl Stream<Item = Result<ActRequest, ActResult>> {
+fn acts(messages: impl Stream<Item = Result<Message, axum::Error>>, ear: Arc<Ear>) -> impl Stream<Item = Result<ActRequest, ActResult>> {
     let listener = ear.clone();
     let open = messages.scan((), move |(), message| {
         listener.hear();
@@ -200,7 +196,7 @@ fn acts(
             }
         })
     });
-    open.filter_map(move |message| future::ready(ear.act(&message, &service)))
+    open.filter_map(move |message| future::ready(ear.act(&message)))
 }
 
 /// What is said to the client.

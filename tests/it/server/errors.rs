@@ -196,9 +196,10 @@ async fn observations_that_do_not_fit() {
 /// An array stood for an object, its values in the order of the server's fields, and an object for a word.
 #[tokio::test(flavor = "multi_thread")]
 async fn json_that_does_not_fit() {
-    let server = start(|config| config.limits.json_depth_max = 8).await;
+    let server = start(|_| {}).await;
     let id = server.open(json!({})).await;
-    let deep = format!(r#"{{"step":1,"observation":{{"state":{}1{}}}}}"#, "[".repeat(9), "]".repeat(9));
+    let brackets = "[".repeat(100_000);
+    let deep = format!(r#"{{"step":1,"observation":{{"state":{brackets}"#);
     let (request, observation) = ("REQUEST_INVALID", "OBSERVATION_INVALID");
     for (body, reason, field) in [
         ("", request, "body"),
@@ -228,7 +229,8 @@ async fn json_that_does_not_fit() {
         (r#"{"step":1,"observation":{"state":[0,0,0,0],"goal":1}}"#, observation, "observation.goal"),
         (r#"{"step":1,"step":1,"observation":{"state":[0,0,0,0]}}"#, request, "step"),
         (r#"{"step":1,"observation":{"state":[0,0,0,0],"executed":[{"actions":[0,0]}]}}"#, observation, "observation.executed[0].actions"),
-        (deep.as_str(), request, "body"),
+        (brackets.as_str(), request, "body"),
+        (deep.as_str(), observation, "observation.state[0]"),
     ] {
         let reply = server.http("POST", &format!("/v1/sessions/{id}/act"), body).await;
         assert_eq!((reply.status, reply.reason().as_str()), (400, reason), "{body}");
@@ -247,6 +249,7 @@ async fn json_that_does_not_fit() {
         (&reset, "[3]", "body"),
         (batch, r#"[[{"session_id":"a","step":1}]]"#, "body"),
         (batch, r#"{"acts":[["a",1,{"state":[0,0,0,0]}]]}"#, "acts[0]"),
+        ("/v1/sessions", &format!(r#"{{"options":{{"kappa":{brackets}"#), "body"),
     ] {
         let reply = server.http("POST", path, body).await;
         assert_eq!((reply.status, reply.reason().as_str()), (400, "REQUEST_INVALID"), "{path} {body}");

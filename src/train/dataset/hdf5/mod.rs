@@ -20,7 +20,6 @@ use hdf5_reader::{
 use links::Links;
 use sha2::{Digest, Sha256};
 use std::{
-    fmt::Write as _,
     fs::File,
     io::{self, Read as _},
     ops::Range,
@@ -282,16 +281,8 @@ fn digest(path: &Path) -> io::Result<String> {
     let (mut sha, mut piece) = (Sha256::new(), vec![0; PIECE_BYTES]);
     loop {
         match file.read(&mut piece)? {
-            0 => return Ok(hex(&sha.finalize())),
+            0 => return Ok(sha.finalize().iter().map(|byte| format!("{byte:02x}")).collect()),
             len => sha.update(&piece[..len]),
         }
     }
-}
-
-/// Lower-case hexadecimal.
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::new(), |mut text, byte| {
-        write!(text, "{byte:02x}").expect("writing to a string cannot fail: is a bug");
-        text
-    })
 }
