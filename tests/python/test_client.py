@@ -236,18 +236,6 @@ def test_nobody_there_is_unavailable() -> None:
             client.models()
 
 
-def test_a_connection_that_the_server_closed_while_idle_is_not_used(core: Core) -> None:
-    """An idle kept-alive connection ends on the server's side at any time; opening a session must not fail over it."""
-    with serving(core, "http") as url, Client(url, retry=RetryPolicy(attempts=1)) as client:
-        client.open_session()
-        (idle,) = client._face._idle  # type: ignore[attr-defined]
-        import socket
-
-        idle.sock.shutdown(socket.SHUT_RD)
-        client.open_session()
-    assert len(core.sessions) == 2
-
-
 def test_the_broker_hands_out_and_reports(client: Client, core: Core) -> None:
     with client.open_session() as session:
         broker = ChunkBroker(session)

@@ -1,4 +1,11 @@
-"""The REST face: JSON <-> plain data, over kept-alive connections of the standard library."""
+"""The REST face: JSON <-> plain data, over kept-alive connections of the standard library.
+
+Why its own pool, and not urllib3's (tried with 2.8): what is long here would stay. urllib3 bounds each wait for bytes and not the whole
+answer, and sends a body that says `Expect: 100-continue` without waiting to be asked for it. Both can be put in by overriding three methods
+of its connection, one of which has to raise BrokenPipeError to make it read the answer to a body that was refused. That passes the same
+tests, is 27 lines shorter, needs one package more, and does 0.77 times as many acts a second (one client, `models/tiny`, in turns with
+this one in one process): a call takes half as much CPU time again.
+"""
 
 from __future__ import annotations
 
