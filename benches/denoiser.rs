@@ -96,7 +96,7 @@ fn train_step(c: &mut Criterion) {
             imagined: vec![0; batch_size],
             noise: random([batch_size, T, STATE + ACTION]),
         };
-        let options = RefineOptions { routing: LatentRouting::Matched, first_action_weight: 10.0, sub_steps: 1 };
+        let options = RefineOptions { routing: LatentRouting::Matched, first_action_weight: 10.0, sub_steps: 1, moves_latents: true };
         c.bench_function(&format!("train-step/{name}/batch-{batch_size}"), |b| {
             b.iter(|| {
                 networks.refine_loss(&config.method.plan, &batch, &options).expect("computes").loss.backward().expect("differentiates")

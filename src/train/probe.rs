@@ -46,15 +46,24 @@ pub fn places(episodes: &[Episode], rows_max: usize) -> Vec<Place> {
 /// If a tensor operation fails.
 pub fn latent_means(latent: &LatentModel, episodes: &[Episode], places: &[Place], evidence: Evidence, looks: Looks) -> Result<Table> {
     let mut out = Table::new(0);
-    for chunk in places.chunks(CHUNK) {
+    // A GRU that runs on reads each episode once.
+    let together = |a: &Place, b: &Place| looks != Looks::Running || a.0 == b.0;
+    for chunk in places.chunk_by(together).flat_map(|places| places.chunks(CHUNK)) {
         let pasts: Vec<_> = chunk.iter().map(|(episode, t)| (&episodes[*episode], *t as isize)).collect();
-        let (history, lens) = histories(&pasts, looks, |_, _| Seen::ALL)?;
         let mut ahead = TokenRows::new(pasts[0].0.layout);
         for (episode, t) in &pasts {
             evidence.ahead().iter().zip(*t..).try_for_each(|(seen, at)| ahead.push(episode, at, *seen))?;
         }
         let ahead = ahead.tokens(pasts.len(), evidence.ahead().len())?;
-        let posterior = latent.infer_behind(&history, lens.as_deref(), &ahead)?;
+        let posterior = match looks {
+            Looks::Block(_) => latent.infer_after(&latent.past(&histories(&pasts, looks, |_, _| Seen::ALL)?.0, None)?, &ahead)?,
+            Looks::Running => {
+                let (episode, at) = (pasts[0].0, chunk.iter().map(|(_, t)| *t).collect::<Vec<_>>());
+                let mut whole = TokenRows::new(episode.layout);
+                (0..episode.len()).try_for_each(|t| whole.push(episode, t as isize, Seen::ALL))?;
+                latent.infer_within(&whole.tokens(1, episode.len())?, &at, &ahead)?
+            }
+        };
         let gaussian = if evidence == Evidence::Filter { latent.coming(posterior)? } else { posterior };
         out.width = gaussian.mean.dim(candle_core::D::Minus1)?;
         out.values.extend(gaussian.mean.flatten_all()?.to_vec1::<f32>()?.into_iter().map(f64::from));

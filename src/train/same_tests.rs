@@ -111,7 +111,8 @@ fn check(config: &ModelConfig, hide: Hide) {
         ready_fraction: 0.5,
         hide,
     };
-    let options = RefineOptions { routing: LatentRouting::Matched, first_action_weight: 1.0, sub_steps: sampler.sub_steps };
+    let options =
+        RefineOptions { routing: LatentRouting::Matched, first_action_weight: 1.0, sub_steps: sampler.sub_steps, moves_latents: true };
     let (places, mut seen_rows) = (Places::new(&episodes, 0, plan.horizon), std::collections::BTreeSet::new());
     for seed in 0..12 {
         let batch = windows(&episodes, &places, &shape, None, &mut Philox::new(seed)).unwrap();

@@ -51,7 +51,7 @@ impl Product {
 pub fn product(task: &Task, learner: &Learner) -> Result<Product> {
     let (networks, tensors) = learner.averaged(task)?;
     let latent_spread = networks.latent.as_ref().map_or(Ok(0.0), |latent| latent_spread(task, latent))?;
-    let errors = DenoiseLoss::new(task, 1.0).held_out_errors(&networks)?;
+    let errors = DenoiseLoss::of_product(task).held_out_errors(&networks)?;
     let held_out_loss = errors.iter().sum::<f64>() / errors.len() as f64;
     let metrics = metrics(task, learner, &networks, &errors)?;
     let mut config = task.config.clone();

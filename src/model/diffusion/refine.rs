@@ -11,7 +11,7 @@ use crate::model::{
     Networks,
     columns::Columns,
     denoiser::Given,
-    latent::{Evidence, Gaussian, LatentModel, Tokens},
+    latent::{Evidence, Gaussian, LatentModel, Past, Tokens},
     method::Diffusion,
     trajectory::{Layout, Seen},
 };
@@ -40,6 +40,8 @@ pub struct RefineOptions {
     pub first_action_weight: f32,
     /// Sub-steps per rung (n).
     pub sub_steps: usize,
+    /// Whether the latent networks learn from this loss; else latents are facts, and nothing is computed on the way back to them.
+    pub moves_latents: bool,
 }
 
 /// Where a training window stands on its way down.
@@ -147,7 +149,8 @@ impl Networks {
         let mut loss = Tensor::new(0f32, &Device::Cpu)?;
         let (mut prior, mut posterior) = ((0.0, 0), (0.0, 0));
         for routed in self.route(batch, &noised, options.routing)? {
-            let condition = Given { levels: &noised.levels, latents: routed.latents.as_ref(), observed: batch.observed.as_ref() };
+            let latents = routed.latents.map(|latents| if options.moves_latents { latents } else { latents.detach() });
+            let condition = Given { levels: &noised.levels, latents: latents.as_ref(), observed: batch.observed.as_ref() };
             let x0 = self.denoiser.predict(&noised.x, &condition)?;
             let error = ((x0 - &batch.window)?.sqr()? * &weights)?.sum((1, 2))?;
             loss = (loss + error.mean_all()?.affine(routed.weight, 0.0)?)?;
@@ -174,7 +177,8 @@ impl Networks {
         let Some(latent) = &self.latent else {
             return Ok(vec![Routed { latents: None, weight: 1.0, refined: vec![false; count] }]);
         };
-        let prior = || prior_latents(latent, batch);
+        let past = latent.past(&batch.history, batch.history_lens.as_deref())?;
+        let prior = || prior_latents(latent, &past, batch);
         // A belief that is held is not refined: there is nothing that waits for the window.
         let routing = if latent.prior.is_some() { routing } else { LatentRouting::PriorOnly };
         Ok(match routing {
@@ -182,7 +186,7 @@ impl Networks {
             LatentRouting::Matched => {
                 let ready: Vec<f32> = noised.ready.iter().map(|ready| f32::from(*ready)).collect();
                 let ready = Tensor::from_vec(ready, (count, 1, 1), &Device::Cpu)?;
-                let (prior, refined) = (prior()?, refined_latents(latent, batch, noised)?);
+                let (prior, refined) = (prior()?, refined_latents(latent, &past, batch, noised)?);
                 let latents = (prior.broadcast_mul(&ready.affine(-1.0, 1.0)?)? + refined.broadcast_mul(&ready)?)?;
                 vec![Routed { latents: Some(latents), weight: 1.0, refined: noised.ready.clone() }]
             }
@@ -194,23 +198,18 @@ impl Networks {
     }
 }
 
-/// Posterior after the history and the tokens `ahead` of it.
-fn infer(latent: &LatentModel, batch: &WindowBatch, ahead: Tokens) -> Result<Gaussian> {
-    latent.infer_behind(&batch.history, batch.history_lens.as_deref(), &ahead)
-}
-
 /// Prior roll-out from real history and the current state: what a sampler above READY has.
-fn prior_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<Tensor> {
+fn prior_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch) -> Result<Tensor> {
     let current = window_tokens(batch, &batch.window, Evidence::Filter.ahead(), None)?;
-    let filter = infer(latent, batch, current)?;
+    let filter = latent.infer_after(past, &current)?;
     chain_means(latent, filter, Vec::new(), batch.window.dim(1)?)
 }
 
 /// Posterior of position 0 from history and the noised tokens 0 and 1, and the prior chain from it: what a sampler at READY has.
-fn refined_latents(latent: &LatentModel, batch: &WindowBatch, noised: &Noised) -> Result<Tensor> {
+fn refined_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch, noised: &Noised) -> Result<Tensor> {
     let len = batch.window.dim(1)?;
     let tokens = window_tokens(batch, &noised.refined_from.x, Evidence::Refinement.ahead_within(len), Some(&noised.refined_from.sigma))?;
-    let posterior = infer(latent, batch, tokens)?;
+    let posterior = latent.infer_after(past, &tokens)?;
     let head = posterior.mean.clone();
     chain_means(latent, posterior, vec![head], len - 1)
 }

@@ -25,7 +25,7 @@ fn config() -> ModelConfig {
 }
 
 fn options(routing: LatentRouting) -> RefineOptions {
-    RefineOptions { routing, first_action_weight: 10.0, sub_steps: 1 }
+    RefineOptions { routing, first_action_weight: 10.0, sub_steps: 1, moves_latents: true }
 }
 
 fn values(seed: u64) -> Vec<f32> {
@@ -139,9 +139,9 @@ fn loss_is_the_weighted_mean_square() {
 fn gradients_reach_latents_and_denoiser() {
     let params = Params::fresh(1);
     let networks = Networks::new(config().layout, &config().method, &params).unwrap();
-    let reached = |row| {
-        let terms =
-            networks.refine_loss(&config().method.plan, &batch(values(1), values(2), row), &options(LatentRouting::Matched)).unwrap();
+    let reached_if = |row, moves_latents| {
+        let options = RefineOptions { moves_latents, ..options(LatentRouting::Matched) };
+        let terms = networks.refine_loss(&config().method.plan, &batch(values(1), values(2), row), &options).unwrap();
         let grads = terms.loss.backward().unwrap();
         let reached = params
             .vars()
@@ -151,7 +151,9 @@ fn gradients_reach_latents_and_denoiser() {
     };
     // The output layer starts at zero, so at first only it and the input skip move; the skip sees the latents.
     for row in [0, LEN - 1] {
-        let names = reached(row);
+        let names = reached_if(row, true);
+        let facts = reached_if(row, false);
+        assert!(facts.iter().all(|name| !name.starts_with("latent.")) && !facts.is_empty(), "{facts:?}");
         for needed in ["denoiser.input_skip.weight", "latent.encoder.gru.weight_hh_l0", "latent.prior.0.weight"] {
             assert!(names.iter().any(|name| name == needed), "{needed} is not reached from row {row}: {names:?}");
         }

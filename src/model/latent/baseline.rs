@@ -83,7 +83,8 @@ impl Baseline {
         })
     }
 
-    /// How far each token is from what was expected; only where [`super::Before::told`] says so is that more than numbers.
+    /// How far each token is from what was expected: facts for all who look at them, which move no baseline. Only where
+    /// [`super::Before::told`] says so are they more than numbers.
     ///
     /// # Errors
     /// If widths differ from the layout, or nobody says what came before the tokens.
@@ -92,8 +93,9 @@ impl Baseline {
         let arrival = self.change.forward(&V::beside(&[&before.state, &before.action])?)?.plus(&before.state)?;
         let action = self.action.forward(&tokens.state)?;
         let reward = self.reward.forward(&V::beside(&[&tokens.state, &tokens.action])?)?;
-        let surprise =
-            |seen: &V, expected, i: usize| seen.clone().difference(expected, &self.surprise[i])?.clamped(-SURPRISE_MAX, SURPRISE_MAX);
+        let surprise = |seen: &V, expected, i: usize| {
+            seen.clone().difference(expected, &self.surprise[i])?.clamped(-SURPRISE_MAX, SURPRISE_MAX).map(V::detached)
+        };
         Ok(Surprises {
             state: surprise(&tokens.state, &arrival, 0)?,
             action: surprise(&tokens.action, &action, 1)?,

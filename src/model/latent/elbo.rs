@@ -62,7 +62,7 @@ impl LatentModel {
 
     /// How far each token of a block is from what was expected: facts, of which the encoder is shown some and the decoders have to explain all.
     fn surprises(&self, tokens: &Tokens) -> Result<Option<Surprises>> {
-        let of = |baseline: &Baseline| baseline.surprises(&tokens.clone().following(None)?)?.map(|surprise| Ok(surprise.detach()));
+        let of = |baseline: &Baseline| baseline.surprises(&tokens.clone().following(None)?);
         self.baseline.as_ref().map(of).transpose()
     }
 

@@ -225,3 +225,19 @@ fn surprises_by_hand() {
     assert_eq!(flat(&baseline.surprises(&rest).unwrap().state), flat(&surprises.state.narrow(1, 2, 3).unwrap().contiguous().unwrap()));
     assert!(baseline.surprises(&tokens).is_err(), "nobody said what came before");
 }
+
+/// At many places of an episode that is read once, and at each after its own history: the same beliefs.
+#[test]
+fn places_of_one_episode() {
+    let params = Params::fresh(2);
+    let model = beside(Some(Baseline { width: 5 }), Future::Prior, &params);
+    let episode = batch().tokens.map(|column| column.narrow(0, 0, 1)).unwrap();
+    let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let at = [0, 2, 3];
+    let ahead = episode.pick(&at.map(Some)).unwrap();
+    let together = model.infer_within(&episode, &at, &ahead).unwrap();
+    for (row, t) in at.into_iter().enumerate() {
+        let alone = model.infer_after(&model.past(&episode, Some(&[t])).unwrap(), &episode.narrow(t, 1).unwrap()).unwrap();
+        assert_eq!(flat(&together.mean.narrow(0, row, 1).unwrap()), flat(&alone.mean), "{t}");
+    }
+}

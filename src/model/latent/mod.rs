@@ -64,20 +64,38 @@ impl LatentModel {
         self.encoder.posterior(&self.read(block, before)?)
     }
 
-    /// The same from a history and the tokens `ahead` of it: one block, or, where a GRU runs on and the history says how many tokens each row
-    /// has, from its state there.
+    /// What a history leaves behind: a whole block, or of a GRU that runs on so many tokens of each row.
     ///
     /// # Errors
     /// As [`Self::infer`].
-    pub fn infer_behind(&self, history: &Tokens, lens: Option<&[usize]>, ahead: &Tokens) -> Result<Gaussian> {
-        match lens {
-            None => self.infer(&self.noticed(history.concat(ahead)?, None)?, None),
-            Some(lens) => {
-                let last: Vec<_> = lens.iter().map(|len| len.checked_sub(1)).collect();
-                let ahead = self.noticed(ahead.clone(), Some(&history.at(&last)?))?;
-                self.infer(&ahead, Some(&self.read_to(history, lens)?))
-            }
-        }
+    pub fn past(&self, history: &Tokens, lens: Option<&[usize]>) -> Result<Past> {
+        let (batch, len) = history.batch_len()?;
+        let state = match lens {
+            None => self.read(&self.noticed(history.clone(), None)?, None)?,
+            Some(lens) => self.read_to(history, lens)?,
+        };
+        let lens = lens.map_or_else(|| vec![len; batch], <[usize]>::to_vec);
+        let last: Vec<Option<usize>> = lens.iter().map(|len| len.checked_sub(1)).collect();
+        Ok(Past { state, last: history.at(&last)? })
+    }
+
+    /// Posterior after the tokens `ahead` of a past.
+    ///
+    /// # Errors
+    /// As [`Self::infer`].
+    pub fn infer_after(&self, past: &Past, ahead: &Tokens) -> Result<Gaussian> {
+        self.infer(&self.noticed(ahead.clone(), Some(&past.last))?, Some(&past.state))
+    }
+
+    /// The same at many places of one episode, of a GRU that runs on over it and so reads it once: after the tokens before `at[i]`, row i of
+    /// `ahead`. `episode` is `(1, L)`.
+    ///
+    /// # Errors
+    /// As [`Self::infer`].
+    pub fn infer_within(&self, episode: &Tokens, at: &[usize], ahead: &Tokens) -> Result<Gaussian> {
+        let states = self.states(&self.noticed(episode.clone(), None)?, None)?;
+        let before: Vec<Option<usize>> = at.iter().map(|at| at.checked_sub(1)).collect();
+        self.infer_after(&Past { state: tokens::pick(&states, &before)?, last: episode.pick(&before)? }, ahead)
     }
 
     /// State of the GRU after the last token, `(B, 1, hidden)`.
@@ -138,6 +156,14 @@ impl LatentModel {
             None => Ok(start),
         }
     }
+}
+
+/// What a history leaves behind for what comes after it.
+pub struct Past {
+    /// Of the GRU, `(B, 1, hidden)`.
+    state: Tensor,
+    /// The last token, `(B, 1)`.
+    last: Tokens,
 }
 
 #[cfg(test)]

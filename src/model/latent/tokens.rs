@@ -40,6 +40,15 @@ fn told(before: [bool; 3], seen: [bool; 3]) -> [f32; 3] {
     [before[0] && before[1] && seen[0], acted, acted && seen[2]].map(f32::from)
 }
 
+/// Rows of `(1, L, width)` at these places, `(n, 1, width)`; zeros where there is no place.
+pub(super) fn pick(sequence: &Tensor, places: &[Option<usize>]) -> Result<Tensor> {
+    let device = sequence.device();
+    let index: Vec<u32> = places.iter().map(|place| place.unwrap_or(0) as u32).collect();
+    let there: Vec<f32> = places.iter().map(|place| f32::from(place.is_some())).collect();
+    let rows = sequence.squeeze(0)?.index_select(&Tensor::new(index, device)?, 0)?.unsqueeze(1)?;
+    rows.broadcast_mul(&Tensor::from_vec(there, (places.len(), 1, 1), device)?)
+}
+
 fn seen(token: TokenRef) -> [bool; 3] {
     [token.state.is_some(), token.action.is_some(), token.reward.is_some()]
 }
@@ -153,6 +162,14 @@ impl Tokens {
         let chosen: Vec<f32> = index.iter().flat_map(|index| (0..len).map(move |at| f32::from(Some(at) == *index))).collect();
         let chosen = Tensor::from_vec(chosen, (batch, 1, len), self.state.device())?;
         Self { before: None, ..self.clone() }.map(|column| chosen.matmul(column))
+    }
+
+    /// Of one sequence, `(1, L)`, the tokens at these places as rows of their own, `(n, 1)`; nothing that is known where there is no place.
+    ///
+    /// # Errors
+    /// If a place lies outside.
+    pub fn pick(&self, places: &[Option<usize>]) -> Result<Self> {
+        Self { before: None, ..self.clone() }.map(|column| pick(column, places))
     }
 
     /// Positions `start..start + len` of every row.

@@ -21,6 +21,10 @@ impl Value for Tensor {
         dims(Tensor::shape(self))
     }
 
+    fn detached(self) -> Self {
+        self.detach()
+    }
+
     fn run(&self, layer: &Layer, others: &[&Self]) -> Result<Self> {
         let mut args = std::iter::once(&self).chain(others).map(|arg| arg.contiguous()).collect::<Result<Vec<_>>>()?;
         let mut shell = Shell { op: layer.op, inputs: args.len(), weight_len: 0, constants: None };

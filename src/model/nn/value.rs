@@ -20,6 +20,11 @@ pub trait Value: Clone {
     /// For a tensor of another rank.
     fn shape(&self) -> Result<[usize; 3]>;
 
+    /// The same numbers as a fact: no gradient goes through them.
+    fn detached(self) -> Self {
+        self
+    }
+
     /// The layer's operation on this value and others.
     ///
     /// # Errors

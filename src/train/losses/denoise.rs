@@ -16,7 +16,10 @@ use crate::train::{
         hidden::Hide,
         window::{Levels, Places, WindowShape, windows},
     },
-    recipe::losses::{Loss, TrainingLevels},
+    recipe::{
+        losses::{Loss, TrainingLevels},
+        stages::Group,
+    },
 };
 use anyhow::Result;
 use std::ops::Range;
@@ -41,12 +44,17 @@ pub struct DenoiseLoss<'a> {
 impl<'a> DenoiseLoss<'a> {
     /// As the stage with this index has it; none where it does not.
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
-        let weight = task.recipe.stages.get(stage)?.weight(Loss::Denoise);
-        (weight > 0.0).then(|| Self::new(task, weight))
+        let stage = task.recipe.stages.get(stage)?;
+        let (weight, moves_latents) = (stage.weight(Loss::Denoise), stage.trains.contains_key(&Group::Latent));
+        (weight > 0.0).then(|| Self::new(task, weight, moves_latents))
     }
 
-    /// For what is shipped, whose error is told whatever the weight was.
-    pub fn new(task: &'a Task, weight: f64) -> Self {
+    /// For what is shipped, whose error is told whatever the stage was.
+    pub fn of_product(task: &'a Task) -> Self {
+        Self::new(task, 1.0, false)
+    }
+
+    fn new(task: &'a Task, weight: f64, moves_latents: bool) -> Self {
         let (loss, sampler, plan) = (&task.recipe.losses.denoise, &task.recipe.sampler, &task.config.method.plan);
         let shape = WindowShape {
             batch: loss.batch,
@@ -62,7 +70,12 @@ impl<'a> DenoiseLoss<'a> {
             ready_fraction: loss.ready_fraction,
             hide: task.recipe.hide,
         };
-        let options = RefineOptions { routing: loss.routing, first_action_weight: loss.first_action_weight, sub_steps: sampler.sub_steps };
+        let options = RefineOptions {
+            routing: loss.routing,
+            first_action_weight: loss.first_action_weight,
+            sub_steps: sampler.sub_steps,
+            moves_latents,
+        };
         Self { task, weight, places: shape.places(&task.split.train), shape, options }
     }
 
