@@ -26,14 +26,20 @@ impl Buffer {
     }
 }
 
-/// Inputs one after the other, and how many.
-fn inputs<'a>(first: View<'a>, others: &[&'a Buffer]) -> Result<([View<'a>; INPUTS_MAX], usize)> {
-    let (mut inputs, count) = ([first; INPUTS_MAX], 1 + others.len());
-    if count > INPUTS_MAX {
-        bail!("{count} inputs, at most {INPUTS_MAX}");
+/// Calls `run` with the inputs one after the other. Most operations have one or two, and a row of eight costs more to fill than they to do.
+#[inline]
+fn with_inputs<R>(first: View, others: &[&Buffer], run: impl FnOnce(&[View]) -> Result<R>) -> Result<R> {
+    match others {
+        [] => run(&[first]),
+        [second] => run(&[first, second.view()]),
+        [second, third] => run(&[first, second.view(), third.view()]),
+        _ if others.len() >= INPUTS_MAX => bail!("{} inputs, at most {INPUTS_MAX}", 1 + others.len()),
+        _ => {
+            let mut inputs = [first; INPUTS_MAX];
+            inputs[1..].iter_mut().zip(others).for_each(|(input, other)| *input = other.view());
+            run(&inputs[..=others.len()])
+        }
     }
-    inputs[1..].iter_mut().zip(others).for_each(|(input, other)| *input = other.view());
-    Ok((inputs, count))
 }
 
 impl Deref for Buffer {
@@ -65,20 +71,23 @@ impl Value for Buffer {
         if layer.op.form() != Form::Anew {
             return self.clone().run_in_place(layer, others);
         }
-        let (inputs, count) = inputs(self.view(), others)?;
-        let shape = layer.op.shape(&inputs[..count])?;
-        let mut values = Pooled::take(shape.iter().product());
-        layer.weights.with(|weights| layer.op.forward(&inputs[..count], weights, &mut values))?;
-        Ok(Self { values, shape })
+        with_inputs(self.view(), others, |inputs| {
+            let shape = layer.op.shape(inputs)?;
+            let mut values = Pooled::take(shape.iter().product());
+            layer.weights.with(|weights| layer.op.forward(inputs, weights, &mut values))?;
+            Ok(Self { values, shape })
+        })
     }
 
     fn run_in_place(mut self, layer: &Layer, others: &[&Self]) -> Result<Self> {
         if layer.op.form() == Form::Anew {
             return self.run(layer, others);
         }
-        let (inputs, count) = inputs(View { values: &[], shape: self.shape }, others)?;
-        layer.op.shape(&inputs[..count])?;
-        layer.weights.with(|weights| layer.op.forward(&inputs[..count], weights, &mut self.values))?;
+        let (values, shape) = (&mut self.values, self.shape);
+        with_inputs(View { values: &[], shape }, others, |inputs| {
+            layer.op.shape(inputs)?;
+            layer.weights.with(|weights| layer.op.forward(inputs, weights, values))
+        })?;
         Ok(self)
     }
 }
