@@ -131,6 +131,81 @@ fn a_baseline_has_one_stage() {
     assert!(!agent.spec().trained.refined && agent.networks().latent.is_none());
 }
 
+/// Three stages: what needs no context, what is hidden, and the planner with that held; a GRU that runs on.
+const BESIDE_A_BASELINE: [&str; 8] = [
+    "model.latent.looks=running",
+    "model.latent.baseline={width = 5}",
+    "losses.context_free={batch = 8}",
+    "losses.elbo.action_weight=1.0",
+    "sampler.action_horizon=1",
+    "stages.denoise.trains={denoiser = 1.0}",
+    "stages.denoise.minimizes={denoise = 1.0}",
+    "stages.identify.steps=4",
+];
+
+/// The small recipe with a stage of its own for the baseline in front.
+fn beside_a_baseline(dir: &Path) -> Recipe {
+    let stage = "[[stages]]\nname = \"baseline\"\nsteps = 9\nminimizes = { context_free = 1.0 }\ntrains = { baseline = 1.0 }\n\
+                 learning_rate = { peak = 1e-2, end = 1e-4, warm_up = 2, decay = \"cosine\" }\nweight_decay = 0.0\n";
+    let path = dir.join("recipe.toml");
+    fs::write(&path, RECIPE.replacen("[[stages]]", &format!("{stage}[[stages]]"), 1)).unwrap();
+    Recipe::read(&path, &BESIDE_A_BASELINE.map(String::from), None).unwrap()
+}
+
+#[test]
+fn a_baseline_is_trained_first_and_held() {
+    let dir = tempfile::tempdir().unwrap();
+    let recipe = beside_a_baseline(dir.path());
+    let run_to = |out: &str, stop| {
+        let (recipe, options) = (recipe.clone(), options(&dir.path().join(out), stop));
+        let worker = std::thread::Builder::new().stack_size(64 << 20).spawn(move || run(recipe, options)).unwrap();
+        worker.join().unwrap().unwrap()
+    };
+    assert_eq!(run_to("whole", None), Outcome::Finished);
+    [5, 6, 7].into_iter().for_each(|stop| assert_eq!(run_to("parts", Some(stop)), Outcome::Stopped));
+    run_to("parts", None);
+    let [whole, parts] = ["whole", "parts"].map(|out| shipped(&dir.path().join(out)));
+    assert!(whole == parts, "the weights differ");
+    // Surprises are in units of what the first stage left, and the stages after it did not move the baseline.
+    run_to("early", Some(10));
+    let tensors = |name: &str| candle_core::safetensors::load(dir.path().join(name), &candle_core::Device::Cpu).unwrap();
+    let (early, last) = (tensors("early/training/state.safetensors"), tensors("whole/model.safetensors"));
+    let flat = |tensor: &candle_core::Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let of_baseline: Vec<_> = last.keys().filter(|name| name.starts_with("latent.baseline.")).collect();
+    assert!(of_baseline.len() > 10);
+    of_baseline.iter().for_each(|name| assert_eq!(flat(&early[&format!("var.{name}")]), flat(&last[*name]), "{name}"));
+    let scale = flat(&last["latent.baseline.surprise.state.scale"]);
+    assert!(scale.iter().all(|scale| scale.is_finite() && *scale > 0.0 && *scale != 1.0), "{scale:?}");
+    assert_ne!(flat(&early["var.latent.encoder.mean.weight"]), flat(&last["latent.encoder.mean.weight"]));
+    let agent = checkpoint::load(&dir.path().join("whole")).unwrap();
+    assert!(agent.spec().trained.refined && agent.spec().trained.action_horizons == [1]);
+    let scores = super::report::probe(&dir.path().join("whole"), Path::new("tests/golden/data_good.h5"), &Room::default()).unwrap().0;
+    assert!(scores.iter().any(|score| score.source == "latent" && score.block_len == 0 && score.error.is_finite()));
+}
+
+/// A baseline is nothing to add in passing: what a recipe lacks or has too much for it is named.
+#[test]
+fn a_baseline_asks_for_its_stage() {
+    let refused = |overrides: &[&str]| recipe_with(overrides).unwrap_err().to_string();
+    let (baseline, loss) = ("model.latent.baseline={width = 5}", "losses.context_free={batch = 8}");
+    assert!(refused(&[baseline]).contains("`losses.context_free`: is missing"));
+    assert!(refused(&[loss]).contains("`losses.context_free`: needs model.latent.baseline"));
+    assert!(refused(&["losses.elbo.action_weight=1.0"]).contains("`losses.elbo.action_weight`: needs model.latent.baseline"));
+    assert!(refused(&[baseline, loss]).contains("`losses.elbo.action_weight`: is missing"));
+    assert!(
+        refused(&[baseline, loss, "losses.elbo.action_weight=1.0"]).contains("`stages`: must begin with one that minimizes context_free")
+    );
+    assert!(refused(&["stages.identify.trains.baseline=1.0"]).contains("`stages.identify.trains.baseline`: needs model.latent.baseline"));
+    assert!(refused(&["stages.identify.trains.denoiser=1.0"]).contains("is not reached by any loss"));
+    assert!(refused(&["stages.identify.minimizes.context_free=1.0"]).contains("needs [losses.context_free]"));
+    assert!(refused(&["model.latent.looks=running"]).contains("`model.latent.looks`: running takes chunks of one action"));
+    let dir = tempfile::tempdir().unwrap();
+    let again = Recipe { stages: beside_a_baseline(dir.path()).stages.into_iter().rev().collect(), ..beside_a_baseline(dir.path()) };
+    let path = dir.path().join("again.toml");
+    fs::write(&path, again.to_toml()).unwrap();
+    assert!(Recipe::read(&path, &[], None).unwrap_err().to_string().contains("stages"));
+}
+
 /// A learning rate that makes the loss NaN: the run ends with one error, and the state of the last checkpoint is still there.
 #[test]
 fn a_loss_that_diverges_keeps_the_last_good_state() {
