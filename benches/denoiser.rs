@@ -10,7 +10,7 @@ use ada_diffuser::model::{
     diffusion::refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
     latent::Tokens,
     method::{Backbone, Future, GruLatent, Looks},
-    nn::{Buffer, Params, Value},
+    nn::{Activations, Buffer, Params},
     noise::Philox,
     options::SamplerOptions,
     trajectory::{Layout, TokenRef},
@@ -46,7 +46,7 @@ fn frozen(config: &ModelConfig) -> Networks {
     Networks::new(config.layout, &config.method, &Params::loaded(tensors)).expect("same names")
 }
 
-fn random<V: Value>(shape: [usize; 3]) -> V {
+fn random<V: Activations>(shape: [usize; 3]) -> V {
     let mut stream = Philox::new(1);
     V::generate(shape, |out| out.iter_mut().for_each(|value| *value = stream.normal())).expect("count fits")
 }

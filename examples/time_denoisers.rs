@@ -9,7 +9,7 @@ use ada_diffuser::model::{
     config::ModelConfig,
     denoiser::{Denoiser, Given},
     method::{Backbone, Future, GruLatent, Looks},
-    nn::{Buffer, Form, Layer, Params, Precision, Value},
+    nn::{Activations, Buffer, Form, Layer, Params, Precision},
     noise::Philox,
     trajectory::Layout,
 };
@@ -128,7 +128,7 @@ fn frozen(config: &ModelConfig, weights: Weights) -> anyhow::Result<Networks> {
     Ok(Networks::new(config.layout, &config.method, &Params::loaded_as(tensors, precision))?)
 }
 
-fn forward<V: Value>(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
+fn forward<V: Activations>(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
     let networks = frozen(config, flags.weights)?;
     let shape = (flags.batch.div_ceil(flags.threads), flags.len);
     let alone = median(rounds::<V>(&networks.denoiser, shape, &Barrier::new(1), 10)?);
@@ -145,7 +145,7 @@ fn forward<V: Value>(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64>
 }
 
 /// Milliseconds of each round, from the moment all threads meet until each has evaluated its windows.
-fn rounds<V: Value>(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: usize) -> anyhow::Result<Vec<f64>> {
+fn rounds<V: Activations>(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: usize) -> anyhow::Result<Vec<f64>> {
     let (x, latents): (V, V) = (normals([batch, len, LAYOUT.dim()])?, normals([batch, len, LATENT])?);
     let levels: Vec<f32> = (0..batch * len).map(|i| (i * 7 % LEVELS) as f32).collect();
     let round = |_| {
@@ -162,7 +162,7 @@ fn rounds<V: Value>(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier
 #[derive(Clone)]
 struct Bare(Buffer);
 
-impl Value for Bare {
+impl Activations for Bare {
     fn generate(shape: [usize; 3], write: impl FnOnce(&mut [f32])) -> Result<Self> {
         Buffer::generate(shape, write).map(Self)
     }
@@ -214,7 +214,7 @@ fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
     Ok(median(times))
 }
 
-fn normals<V: Value>(shape: [usize; 3]) -> anyhow::Result<V> {
+fn normals<V: Activations>(shape: [usize; 3]) -> anyhow::Result<V> {
     let mut stream = Philox::new(1);
     Ok(V::generate(shape, |out| out.iter_mut().for_each(|value| *value = stream.normal()))?)
 }

@@ -35,7 +35,7 @@
 //! What a model is stands in one struct, [`model::method::Method`], word for word the same in a recipe and in a checkpoint; each choice is a
 //! closed enum. [`model::check`] is the one check of it, for recipes, checkpoints and sessions.
 //!
-//! Networks are written once, over any [`model::nn::Value`]: [`model::nn::Buffer`]s here, candle's tensors in training.
+//! Networks are written once, over any [`model::nn::Activations`]: [`model::nn::Buffer`]s here, candle's tensors in training.
 //!
 //! Training is the mirror: recipe -> data set -> its stages, each a sum of losses ([`model::latent::elbo`], [`model::diffusion::refine`]) ->
 //! [`model::checkpoint`]. Losses live beside the networks they train; [`train`] turns the crank.

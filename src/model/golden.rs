@@ -1,6 +1,6 @@
 //! Whole networks against PyTorch's numbers; `tests/golden/make_networks.py` tells how they were made, in float64.
 
-use crate::model::nn::{Buffer, Params, Value};
+use crate::model::nn::{Activations, Buffer, Params};
 use candle_core::{DType, Device, Result, Tensor, Var};
 use std::collections::BTreeMap;
 
@@ -35,7 +35,7 @@ impl Golden {
     }
 
     /// One of them as an input of three dimensions.
-    pub fn value<V: Value>(&self, name: &str) -> V {
+    pub fn value<V: Activations>(&self, name: &str) -> V {
         let number = &self.numbers[name];
         let (batch, steps, channels) = number.dims3().unwrap();
         V::generate([batch, steps, channels], |out| out.copy_from_slice(&flat(number))).unwrap()

@@ -6,7 +6,7 @@ use crate::model::{
     denoiser::Given,
     latent::{Evidence, Gaussian, LatentModel, hold_within},
     method::GruLatent,
-    nn::{Buffer, Value},
+    nn::{Activations, Buffer},
 };
 use candle_core::Result;
 

@@ -5,7 +5,7 @@ use crate::model::{
     config::ModelConfig,
     diffusion::descent::Walk,
     latent::{Evidence, Gaussian, GaussianRef, Tokens},
-    nn::{Buffer, Value},
+    nn::{Activations, Buffer},
     trajectory::TokenRef,
 };
 use candle_core::Result;

@@ -3,7 +3,7 @@
 use super::Inputs;
 use crate::model::nn::{
     Activation::{GeluTanh, Mish, Silu},
-    LayerNorm, Linear, Value,
+    Activations, LayerNorm, Linear,
     params::{Init, Params},
     time_embedding::Sinusoid,
 };
@@ -36,7 +36,7 @@ impl Block {
         })
     }
 
-    fn forward<V: Value>(&self, x: V, cond: &V) -> Result<V> {
+    fn forward<V: Activations>(&self, x: V, cond: &V) -> Result<V> {
         let [modulate, gate, modulate_mlp, gate_mlp] = &self.ada;
         let h = self.norm.forward(&x)?.modulated(&modulate.forward(cond)?)?;
         let h = self.out.forward(&self.qkv.forward(&h)?.attention(self.heads)?)?;
@@ -79,7 +79,7 @@ impl Dit {
         })
     }
 
-    pub(super) fn forward<V: Value>(&self, inputs: &Inputs<V>) -> Result<V> {
+    pub(super) fn forward<V: Activations>(&self, inputs: &Inputs<V>) -> Result<V> {
         let cond = self.embed(inputs)?.activated(Silu)?;
         let mut x = self.inp.forward(inputs.x)?.plus(&self.positions(inputs.x)?)?;
         for block in &self.blocks {
@@ -90,7 +90,7 @@ impl Dit {
     }
 
     /// `(B, T, width)`: level of each position, its inputs, and the real steps.
-    fn embed<V: Value>(&self, inputs: &Inputs<V>) -> Result<V> {
+    fn embed<V: Activations>(&self, inputs: &Inputs<V>) -> Result<V> {
         let level = self.sinusoids(inputs.x, |index| inputs.levels[index])?;
         let emb = self.time[1].forward(&self.time[0].forward(&level)?.activated(Mish)?)?;
         let emb = emb.plus(&self.context.forward(inputs.x)?)?;
@@ -100,13 +100,13 @@ impl Dit {
         }
     }
 
-    fn positions<V: Value>(&self, x: &V) -> Result<V> {
+    fn positions<V: Activations>(&self, x: &V) -> Result<V> {
         let [_, len, _] = x.shape()?;
         self.sinusoids(x, |index| (index % len) as f32)
     }
 
     /// `(B, T, width)` for the batch and the positions of `x`: the sinusoid of `level(b T + t)`.
-    fn sinusoids<V: Value>(&self, x: &V, level: impl Fn(usize) -> f32) -> Result<V> {
+    fn sinusoids<V: Activations>(&self, x: &V, level: impl Fn(usize) -> f32) -> Result<V> {
         let ([batch, len, _], width) = (x.shape()?, self.sinusoid.dim());
         V::generate([batch, len, width], |out| {
             out.chunks_exact_mut(width).enumerate().for_each(|(index, out)| self.sinusoid.write(level(index), out));

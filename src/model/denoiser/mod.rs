@@ -6,7 +6,7 @@ mod unet;
 use crate::model::{
     fit::{Unfit, WIDTH_MAX, require, size},
     method::{Backbone, Diffusion, Method},
-    nn::{Activation::Silu, Linear, Value, params::Params, time_embedding::Sinusoid},
+    nn::{Activation::Silu, Activations, Linear, params::Params, time_embedding::Sinusoid},
 };
 use candle_core::Result;
 use dit::Dit;
@@ -111,7 +111,7 @@ impl Denoiser {
     ///
     /// # Errors
     /// If a shape differs from the configuration, or a condition the network was built with is missing.
-    pub fn predict<V: Value>(&self, x: &V, given: &Given<V>) -> Result<V> {
+    pub fn predict<V: Activations>(&self, x: &V, given: &Given<V>) -> Result<V> {
         let [batch, len, _] = x.shape()?;
         if given.levels.len() != batch * len {
             candle_core::bail!("{} levels for {batch} windows of {len}", given.levels.len());
@@ -132,7 +132,7 @@ impl Denoiser {
         out.plus(&self.input_skip.forward(&x)?)
     }
 
-    fn embed_observed<V: Value>(&self, observed: Option<&V>) -> Result<Option<V>> {
+    fn embed_observed<V: Activations>(&self, observed: Option<&V>) -> Result<Option<V>> {
         match (&self.observed, observed) {
             (Some([first, second]), Some(steps)) => second.forward(&first.forward(steps)?.activated(Silu)?).map(Some),
             (Some(_), None) => candle_core::bail!("this denoiser needs the real steps before the window (obs_horizon > 1)"),

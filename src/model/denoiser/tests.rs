@@ -57,7 +57,7 @@ fn window(seed: u64) -> Window {
     Window { x, latents, observed, levels: (0..LEN).map(|_| stream.below(41) as f32).collect() }
 }
 
-fn predict<V: Value>(denoiser: &Denoiser, windows: &[Window]) -> V {
+fn predict<V: Activations>(denoiser: &Denoiser, windows: &[Window]) -> V {
     let join = |shape: [usize; 2], part: fn(&Window) -> &Vec<f32>| {
         let rows: Vec<f32> = windows.iter().flat_map(|window| part(window).iter().copied()).collect();
         V::generate([windows.len(), shape[0], shape[1]], |out| out.copy_from_slice(&rows)).unwrap()

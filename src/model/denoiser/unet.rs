@@ -2,7 +2,7 @@
 
 use super::Inputs;
 use crate::model::nn::{
-    Activation::Mish, Conv1d, ConvShape, ConvTranspose1d, GroupNormMish, Linear, Value, params::Params, time_embedding::Sinusoid,
+    Activation::Mish, Activations, Conv1d, ConvShape, ConvTranspose1d, GroupNormMish, Linear, params::Params, time_embedding::Sinusoid,
 };
 use candle_core::Result;
 
@@ -26,7 +26,7 @@ impl ConvBlock {
         })
     }
 
-    fn forward<V: Value>(&self, x: &V) -> Result<V> {
+    fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         self.norm.forward(self.conv.forward(x)?)
     }
 }
@@ -51,7 +51,7 @@ impl ResBlock {
     }
 
     /// `x` (B, T, c_in), `emb` (B, 1, EMB) already through Mish.
-    fn forward<V: Value>(&self, x: &V, emb: &V) -> Result<V> {
+    fn forward<V: Activations>(&self, x: &V, emb: &V) -> Result<V> {
         let h = self.first.forward(x)?.plus_at_each_step(&self.embed.forward(emb)?)?;
         let h = self.second.forward(&h)?;
         match &self.skip {
@@ -117,7 +117,7 @@ impl Unet {
         })
     }
 
-    pub(super) fn forward<V: Value>(&self, inputs: &Inputs<V>) -> Result<V> {
+    pub(super) fn forward<V: Activations>(&self, inputs: &Inputs<V>) -> Result<V> {
         let emb = self.embed(inputs)?.activated(Mish)?;
         let h = self.through_depth(0, inputs.x, &emb)?;
         self.out.forward(&self.last.forward(&h)?)
@@ -125,7 +125,7 @@ impl Unet {
 
     /// Down at this depth, through all below it, and up again; what comes out of depth `j > 0` is at the resolution of depth `j - 1`.
     /// The skip of depth 0 is never used: all up levels double the length (Janner's network does the same).
-    fn through_depth<V: Value>(&self, depth: usize, x: &V, emb: &V) -> Result<V> {
+    fn through_depth<V: Activations>(&self, depth: usize, x: &V, emb: &V) -> Result<V> {
         let level = &self.down[depth];
         let skip = through(&level.blocks, x, emb)?;
         let h = match &level.halve {
@@ -140,7 +140,7 @@ impl Unet {
     }
 
     /// `(B, 1, EMB)`: embedding of each window's mean level, plus that of the real steps.
-    fn embed<V: Value>(&self, inputs: &Inputs<V>) -> Result<V> {
+    fn embed<V: Activations>(&self, inputs: &Inputs<V>) -> Result<V> {
         let [batch, len, _] = inputs.x.shape()?;
         let level = V::generate([batch, 1, EMB], |out| {
             for (levels, out) in inputs.levels.chunks_exact(len).zip(out.chunks_exact_mut(EMB)) {
@@ -155,6 +155,6 @@ impl Unet {
     }
 }
 
-fn through<V: Value>(blocks: &[ResBlock; 2], x: &V, emb: &V) -> Result<V> {
+fn through<V: Activations>(blocks: &[ResBlock; 2], x: &V, emb: &V) -> Result<V> {
     blocks[1].forward(&blocks[0].forward(x, emb)?, emb)
 }

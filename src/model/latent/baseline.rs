@@ -4,7 +4,7 @@
 
 use super::{Tokens, mlp::Mlp};
 use crate::model::{
-    nn::{Difference, Linear, Value, params::Params},
+    nn::{Activations, Difference, Linear, params::Params},
     trajectory::Layout,
 };
 use candle_core::{Result, Tensor, bail};
@@ -25,7 +25,7 @@ impl Skip {
         Ok(Self { mlp: Mlp::new(d_in, hidden, d_out, params)?, linear: Linear::new(d_in, d_out, &params.scope("skip"))? })
     }
 
-    fn forward<V: Value>(&self, x: &V) -> Result<V> {
+    fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         self.mlp.forward(x)?.plus(&self.linear.forward(x)?)
     }
 }
@@ -88,7 +88,7 @@ impl Baseline {
     ///
     /// # Errors
     /// If widths differ from the layout, or nobody says what came before the tokens.
-    pub fn surprises<V: Value>(&self, tokens: &Tokens<V>) -> Result<Surprises<V>> {
+    pub fn surprises<V: Activations>(&self, tokens: &Tokens<V>) -> Result<Surprises<V>> {
         let Some(before) = &tokens.before else { bail!("tokens without what came before them: is a bug") };
         let arrival = self.change.forward(&V::beside(&[&before.state, &before.action])?)?.plus(&before.state)?;
         let action = self.action.forward(&tokens.state)?;

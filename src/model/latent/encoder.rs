@@ -6,7 +6,7 @@ use crate::model::{
     nn::{
         Absent,
         Activation::Relu,
-        Gru, Linear, Value,
+        Activations, Gru, Linear,
         params::{Init, Params},
     },
     trajectory::Layout,
@@ -30,7 +30,7 @@ impl Part {
     }
 
     /// `value` (B, L, d_in), `present` (B, L, 1) of 0 or 1.
-    fn forward<V: Value>(&self, value: &V, present: &V) -> Result<V> {
+    fn forward<V: Activations>(&self, value: &V, present: &V) -> Result<V> {
         self.embed.forward(value)?.activated(Relu)?.or_absent(present, &self.absent)
     }
 }
@@ -76,7 +76,7 @@ impl Encoder {
     ///
     /// # Errors
     /// If widths differ from the layout.
-    pub fn states<V: Value>(&self, tokens: &Tokens<V>, surprises: Option<&Surprises<V>>, before: Option<&V>) -> Result<V> {
+    pub fn states<V: Activations>(&self, tokens: &Tokens<V>, surprises: Option<&Surprises<V>>, before: Option<&V>) -> Result<V> {
         self.gru.forward(&self.embed(tokens, surprises)?, before)
     }
 
@@ -84,12 +84,12 @@ impl Encoder {
     ///
     /// # Errors
     /// If the width differs.
-    pub fn posterior<V: Value>(&self, states: &V) -> Result<Gaussian<V>> {
+    pub fn posterior<V: Activations>(&self, states: &V) -> Result<Gaussian<V>> {
         let log_var = self.log_var.forward(states)?.clamped(LOG_VAR.0, LOG_VAR.1)?;
         Ok(Gaussian { mean: self.mean.forward(states)?, log_var })
     }
 
-    fn embed<V: Value>(&self, tokens: &Tokens<V>, surprises: Option<&Surprises<V>>) -> Result<V> {
+    fn embed<V: Activations>(&self, tokens: &Tokens<V>, surprises: Option<&Surprises<V>>) -> Result<V> {
         let part = |part: &Part, value, index| part.forward(value, &tokens.present.channels(index, 1)?);
         let [state, action, reward] =
             [part(&self.state, &tokens.state, 0)?, part(&self.action, &tokens.action, 1)?, part(&self.reward, &tokens.reward, 2)?];
@@ -106,7 +106,7 @@ impl Encoder {
 }
 
 /// Embeddings of surprises where they are told.
-fn surprised<V: Value>(parts: &[Part; 3], surprises: &Surprises<V>, before: &Before<V>) -> Result<[V; 3]> {
+fn surprised<V: Activations>(parts: &[Part; 3], surprises: &Surprises<V>, before: &Before<V>) -> Result<[V; 3]> {
     let part = |index: usize, value: &V| parts[index].forward(value, &before.told.channels(index, 1)?);
     Ok([part(0, &surprises.state)?, part(1, &surprises.action)?, part(2, &surprises.reward)?])
 }

@@ -2,7 +2,7 @@
 
 use super::{Gaussian, gaussian::LOG_VAR, mlp::Mlp};
 use crate::model::{
-    nn::{Value, params::Params},
+    nn::{Activations, params::Params},
     trajectory::Layout,
 };
 use candle_core::Result;
@@ -26,7 +26,7 @@ impl Prior {
     ///
     /// # Errors
     /// If the width differs.
-    pub fn predict<V: Value>(&self, before: &Gaussian<V>) -> Result<Gaussian<V>> {
+    pub fn predict<V: Activations>(&self, before: &Gaussian<V>) -> Result<Gaussian<V>> {
         let out = self.mlp.forward(&V::beside(&[&before.mean, &before.log_var])?)?;
         let mean = out.channels(0, self.dim)?.plus(&before.mean)?;
         Ok(Gaussian { mean, log_var: out.channels(self.dim, self.dim)?.clamped(LOG_VAR.0, LOG_VAR.1)? })
@@ -66,7 +66,7 @@ impl Decoder {
     ///
     /// # Errors
     /// If widths differ.
-    pub fn predict<V: Value>(&self, state: &V, action: &V, latent: &V) -> Result<Told<V>> {
+    pub fn predict<V: Activations>(&self, state: &V, action: &V, latent: &V) -> Result<Told<V>> {
         let x = V::beside(&[state, action, latent])?;
         let of_action = |network: &Mlp| network.forward(&V::beside(&[state, latent])?);
         let action = self.action.as_ref().map(of_action).transpose()?;

@@ -1,6 +1,6 @@
 //! The networks of everything small.
 
-use crate::model::nn::{Activation::Relu, Linear, Value, params::Params};
+use crate::model::nn::{Activation::Relu, Activations, Linear, params::Params};
 use candle_core::Result;
 
 /// Two hidden ReLU layers and a linear one.
@@ -12,7 +12,7 @@ impl Mlp {
         Ok(Self([layer(0, d_in, hidden)?, layer(1, hidden, hidden)?, layer(2, hidden, d_out)?]))
     }
 
-    pub(super) fn forward<V: Value>(&self, x: &V) -> Result<V> {
+    pub(super) fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         let x = self.0[0].forward(x)?.activated(Relu)?;
         self.0[2].forward(&self.0[1].forward(&x)?.activated(Relu)?)
     }

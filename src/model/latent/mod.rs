@@ -17,7 +17,7 @@ pub use tokens::{Before, Tokens};
 
 use crate::model::{
     method::{Future, GruLatent},
-    nn::{Value, params::Params},
+    nn::{Activations, params::Params},
     trajectory::Layout,
 };
 use candle_core::{Result, Tensor};
@@ -60,7 +60,7 @@ impl LatentModel {
     ///
     /// # Errors
     /// If widths differ from the layout.
-    pub fn infer<V: Value>(&self, block: &Tokens<V>, before: Option<&V>) -> Result<Gaussian<V>> {
+    pub fn infer<V: Activations>(&self, block: &Tokens<V>, before: Option<&V>) -> Result<Gaussian<V>> {
         self.encoder.posterior(&self.read(block, before)?)
     }
 
@@ -102,13 +102,13 @@ impl LatentModel {
     ///
     /// # Errors
     /// If widths differ from the layout, or there is no token.
-    pub fn read<V: Value>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
+    pub fn read<V: Activations>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
         let (_, len) = tokens.batch_len()?;
         self.states(tokens, before)?.step(len.saturating_sub(1))
     }
 
     /// States of the GRU after each token, `(B, L, hidden)`.
-    fn states<V: Value>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
+    fn states<V: Activations>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
         let surprises = self.baseline.as_ref().map(|baseline| baseline.surprises(tokens)).transpose()?;
         self.encoder.states(tokens, surprises.as_ref(), before)
     }
@@ -135,7 +135,7 @@ impl LatentModel {
     ///
     /// # Errors
     /// If widths differ, or `each` fails.
-    pub fn roll_out<V: Value>(&self, start: Gaussian<V>, len: usize, mut each: impl FnMut(&Gaussian<V>) -> Result<()>) -> Result<()> {
+    pub fn roll_out<V: Activations>(&self, start: Gaussian<V>, len: usize, mut each: impl FnMut(&Gaussian<V>) -> Result<()>) -> Result<()> {
         let mut now = start;
         for _ in 0..len {
             if let Some(prior) = &self.prior {
@@ -150,7 +150,7 @@ impl LatentModel {
     ///
     /// # Errors
     /// If widths differ.
-    pub fn coming<V: Value>(&self, start: Gaussian<V>) -> Result<Gaussian<V>> {
+    pub fn coming<V: Activations>(&self, start: Gaussian<V>) -> Result<Gaussian<V>> {
         match &self.prior {
             Some(prior) => prior.predict(&start),
             None => Ok(start),

@@ -37,7 +37,7 @@ fn rows() -> Vec<Vec<Token>> {
 }
 
 /// Posterior, and mean and log-variance of the prior chain after it.
-fn chain<V: Value>(model: &LatentModel, rows: &[Vec<Token>], numbers: impl Fn(&V) -> Vec<f32>) -> Vec<u32> {
+fn chain<V: Activations>(model: &LatentModel, rows: &[Vec<Token>], numbers: impl Fn(&V) -> Vec<f32>) -> Vec<u32> {
     let tokens = Tokens::<V>::pack(LAYOUT, rows.iter(), LEN, None, |row, position| row[position].view()).unwrap();
     let posterior = model.infer(&tokens, None).unwrap();
     let mut all = [numbers(&posterior.mean), numbers(&posterior.log_var)].concat();
@@ -76,7 +76,7 @@ fn golden_latent(dim: usize, hidden: usize) -> GruLatent {
 }
 
 /// Posteriors, the prior after the last of them, and what the decoder makes of their means: the results of the golden case, by name.
-fn everything<V: Value>(tokens: &Tokens<V>, params: &Params) -> candle_core::Result<Vec<(String, V)>> {
+fn everything<V: Activations>(tokens: &Tokens<V>, params: &Params) -> candle_core::Result<Vec<(String, V)>> {
     let model = LatentModel::new(&golden_latent(3, 9), LAYOUT, params)?;
     let posteriors = model.encoder.posterior(&model.states(tokens, None)?)?;
     let Told { state: change, reward, .. } = model.decoder.predict(&tokens.state, &tokens.action, &posteriors.mean)?;

@@ -1,7 +1,7 @@
 //! Tokens of a batch of sequences, side by side: what the encoder reads.
 
 use crate::model::{
-    nn::Value,
+    nn::Activations,
     trajectory::{Layout, TokenRef},
 };
 use candle_core::{Result, Tensor};
@@ -53,7 +53,7 @@ fn seen(token: TokenRef) -> [bool; 3] {
     [token.state.is_some(), token.action.is_some(), token.reward.is_some()]
 }
 
-impl<V: Value> Tokens<V> {
+impl<V: Activations> Tokens<V> {
     /// Packs `rows` of `len` tokens each; `token` is asked for each several times. With `first`, which tells the token before a row's first,
     /// what came before each is packed too.
     ///

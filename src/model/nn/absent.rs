@@ -8,7 +8,7 @@ use super::{
 };
 use candle_core::Result;
 
-/// A learned vector in place of what is absent; see [`super::Value::or_absent`].
+/// A learned vector in place of what is absent; see [`super::Activations::or_absent`].
 #[derive(Clone, Debug)]
 pub struct Absent(pub(super) Layer);
 

@@ -2,10 +2,10 @@
 //! been seen.
 
 use super::{
+    activations::Activations,
     kernels::pool::Pooled,
     layer::Layer,
     op::{Form, View},
-    value::Value,
 };
 use candle_core::{Result, bail};
 use std::ops::{Deref, DerefMut};
@@ -56,7 +56,7 @@ impl DerefMut for Buffer {
     }
 }
 
-impl Value for Buffer {
+impl Activations for Buffer {
     fn generate(shape: [usize; 3], write: impl FnOnce(&mut [f32])) -> Result<Self> {
         let mut values = Pooled::zeros(shape.iter().product());
         write(&mut values);

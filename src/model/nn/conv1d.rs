@@ -1,10 +1,10 @@
 //! Convolution over time and its transpose, channels last, with PyTorch's weights (`nn.Conv1d`, `nn.ConvTranspose1d`).
 
 use super::{
+    activations::Activations,
     layer::Layer,
     op::{Conv, Op},
     params::{Init, Params},
-    value::Value,
     weights::Weight,
 };
 use candle_core::{Result, Tensor};
@@ -31,7 +31,7 @@ impl Conv1d {
     ///
     /// # Errors
     /// If `x` has another rank or number of channels, or is shorter than the kernel.
-    pub fn forward<V: Value>(&self, x: &V) -> Result<V> {
+    pub fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         x.run(&self.0, &[])
     }
 }
@@ -58,7 +58,7 @@ impl ConvTranspose1d {
     ///
     /// # Errors
     /// If `x` has another rank or number of channels, or the padding cuts everything off.
-    pub fn forward<V: Value>(&self, x: &V) -> Result<V> {
+    pub fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         x.run(&self.0, &[])
     }
 }

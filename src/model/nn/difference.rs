@@ -8,7 +8,7 @@ use super::{
 };
 use candle_core::Result;
 
-/// The difference of two values in units of its own for each column; see [`super::Value::difference`].
+/// The difference of two values in units of its own for each column; see [`super::Activations::difference`].
 #[derive(Clone, Debug)]
 pub struct Difference(pub(super) Layer);
 

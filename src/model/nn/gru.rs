@@ -1,11 +1,11 @@
 //! The gated recurrent unit, PyTorch's `nn.GRU` of one layer: the whole sequence is one operation with its own way back.
 
 use super::{
+    activations::Activations,
     conv1d::layer,
     layer::Layer,
     op::{Conv, Op, gru_weight},
     params::{Init, Params},
-    value::Value,
     weights::Weight,
 };
 use candle_core::Result;
@@ -37,7 +37,7 @@ impl Gru {
     ///
     /// # Errors
     /// If the shapes of `x` and `before` do not fit each other and the layer.
-    pub fn forward<V: Value>(&self, x: &V, before: Option<&V>) -> Result<V> {
+    pub fn forward<V: Activations>(&self, x: &V, before: Option<&V>) -> Result<V> {
         let ([batch, ..], projected) = (x.shape()?, x.run(&self.inputs, &[])?);
         match before {
             Some(before) => projected.run(&self.states, &[before]),

@@ -1,11 +1,11 @@
 //! The fully connected layer, PyTorch's `nn.Linear`.
 
 use super::{
+    activations::Activations,
     conv1d::layer,
     layer::Layer,
     op::Conv,
     params::{Init, Params},
-    value::Value,
 };
 use candle_core::Result;
 
@@ -51,7 +51,7 @@ impl Linear {
     ///
     /// # Errors
     /// If `x` has another rank or number of channels.
-    pub fn forward<V: Value>(&self, x: &V) -> Result<V> {
+    pub fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         x.run(&self.0, &[])
     }
 }

@@ -2,11 +2,12 @@
 //!
 //! Activations are f32 on the CPU, channels last: `(batch, time, channels)`; weights have PyTorch's names and layouts. What is computed
 //! is one list of operations, [`Op`], each with its shape, forward and backward over [`kernels`]; a [`Layer`] is an operation with its
-//! parameters. Networks are written over any [`Value`], which runs them: candle's tensors with a way back (training), [`Buffer`]s without
+//! parameters. Networks are written over any [`Activations`], which runs them: candle's tensors with a way back (training), [`Buffer`]s without
 //! allocating (inference). In a frozen store ([`Params::frozen`]) weights are packed once, at construction, and not held otherwise. A
 //! row's bits do not depend on the batch around it (see [`kernels`]).
 
 mod absent;
+mod activations;
 mod buffer;
 #[cfg(test)]
 mod candle_faults;
@@ -26,10 +27,10 @@ mod testing;
 #[cfg(test)]
 mod tests;
 pub mod time_embedding;
-mod value;
 mod weights;
 
 pub use absent::Absent;
+pub use activations::Activations;
 pub use buffer::Buffer;
 pub use conv1d::{Conv1d, ConvShape, ConvTranspose1d};
 pub use difference::Difference;
@@ -40,7 +41,6 @@ pub use linear::Linear;
 pub use norm::{GroupNormMish, LayerNorm};
 pub use op::{Form, Op, Past, Slot, View};
 pub use params::{Init, Params};
-pub use value::Value;
 pub use weights::{WeightRef, WeightsRef};
 
 /// What candle says of an error, without the backtrace that it adds where `RUST_BACKTRACE` is set: that is for a debugger, not for a user.

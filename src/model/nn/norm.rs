@@ -1,10 +1,10 @@
 //! Group norm with Mish (one operation, as the U-Net always has them in a row) and layer norm.
 
 use super::{
+    activations::Activations,
     layer::Layer,
     op::{NormKind, Op},
     params::{Init, Params},
-    value::Value,
     weights::Weight,
 };
 use candle_core::{Device, Result, Tensor, bail};
@@ -30,7 +30,7 @@ impl GroupNormMish {
     ///
     /// # Errors
     /// If `x` has another rank or number of channels.
-    pub fn forward<V: Value>(&self, x: V) -> Result<V> {
+    pub fn forward<V: Activations>(&self, x: V) -> Result<V> {
         x.run_in_place(&self.0, &[])
     }
 }
@@ -58,7 +58,7 @@ impl LayerNorm {
     ///
     /// # Errors
     /// If `x` has another rank or number of channels.
-    pub fn forward<V: Value>(&self, x: &V) -> Result<V> {
+    pub fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         x.run(&self.0, &[])
     }
 }

@@ -1,16 +1,16 @@
 //! Values of training: candle's tensors. Every operation goes through one shell, which candle calls on the way forth and on the way back.
 
 use super::{
+    activations::Activations,
     host::{output, slice, values},
     layer::Layer,
     op::{Form, Op, Past, Slot, View},
-    value::Value,
     weights::{Constants, WeightRef, Weights, WeightsRef},
 };
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, CustomOp3, Device, Layout, Result, Shape, Tensor, bail};
 use std::{ops::Deref, sync::Arc};
 
-impl Value for Tensor {
+impl Activations for Tensor {
     fn generate(shape: [usize; 3], write: impl FnOnce(&mut [f32])) -> Result<Self> {
         let mut values = vec![0.0; shape.iter().product()];
         write(&mut values);

@@ -1,6 +1,6 @@
 //! What networks are made of: one closed list of operations, each with its shape, its way forth and its way back, on plain slices.
 //!
-//! Every kind of [`super::Value`] runs this list. A new operation is an arm in each function here, over a kernel.
+//! Every kind of [`super::Activations`] runs this list. A new operation is an arm in each function here, over a kernel.
 
 mod conv;
 mod gru;

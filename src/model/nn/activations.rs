@@ -1,4 +1,4 @@
-//! What networks compute on: a network is written once, over any [`Value`].
+//! What networks compute on: a network is written once, over any [`Activations`].
 //!
 //! Training runs it on candle's tensors, which record the way back; inference on [`super::Buffer`]s, plain numbers in pooled memory. Both go
 //! through the same operations ([`Op`]) and give the same bits.
@@ -7,7 +7,7 @@ use super::{Absent, Difference, kernels::activation::Activation, layer::Layer, o
 use candle_core::{Result, bail};
 
 /// Activations `(batch, steps, channels)`. Every operation is an error where shapes do not fit each other.
-pub trait Value: Clone {
+pub trait Activations: Clone {
     /// A value of this shape, filled by `write`, which finds zeros.
     ///
     /// # Errors
