@@ -17,6 +17,7 @@ from gymnasium import spaces
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
 from .pendulum import PendulumGravityE
+from .pendulum_torque import PendulumTorqueS
 from .point_wind import PointWindS
 from .search import ArsSettings, Search
 from .task import NAMES, HiddenTask
@@ -29,6 +30,7 @@ __all__ = [
     "CheetahWindS",
     "HiddenTask",
     "PendulumGravityE",
+    "PendulumTorqueS",
     "PointWindS",
     "Search",
     "action_noise",
