@@ -2,6 +2,7 @@
 
 use super::{
     Outcome, TRAINING_DIR, Task, gate,
+    judgement::sentence,
     learner::Learner,
     log::Log,
     losses::{Objective, context_free::measure_surprises},
@@ -116,12 +117,15 @@ impl Crank<'_> {
         Ok(())
     }
 
-    /// Probes a stage that looked for the latent, where the data have a context; without a gate everything passes.
+    /// Judges a stage that looked for the latent, by a probe where the data have a context; without a gate everything passes.
     fn passes_gate(&mut self, learner: &mut Learner) -> Result<bool> {
         let (task, stage) = (self.task, &self.task.recipe.stages[learner.position.stage]);
-        let tells = stage.identifies() && task.split.train[0].context_dim > 0;
-        let Some(latent) = learner.networks.latent.as_ref().filter(|_| tells) else { return Ok(true) };
-        let result = gate::probe(task, latent)?;
+        let Some(latent) = learner.networks.latent.as_ref().filter(|_| stage.identifies()) else { return Ok(true) };
+        let held_out = Objective::new(task, learner.position.stage).held_out(&learner.networks)?;
+        let tells = task.split.train[0].context_dim > 0;
+        let probe = tells.then(|| gate::probe(task, latent)).transpose()?;
+        self.log.say(&sentence(&held_out, latent.baseline.is_some(), probe.as_ref()));
+        let Some(result) = probe else { return Ok(true) };
         let successor_state = result.successor_state.map(|error| ("probe_successor_state", error));
         let probed: Vec<_> = [("probe_filter", result.filter)].into_iter().chain(successor_state).collect();
         self.log.write(&learner.position, &probed)?;

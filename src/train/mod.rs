@@ -9,6 +9,7 @@ pub mod dataset;
 pub mod defaults;
 pub mod flags;
 pub mod gate;
+pub mod judgement;
 pub mod learner;
 #[cfg(test)]
 mod legal_tests;

@@ -12,6 +12,7 @@ use crate::train::{
         HELD_OUT_SEED,
         window::{BlockShape, Places, blocks},
     },
+    learner::Scalars,
     recipe::losses::{ElboConfig, Loss},
 };
 use anyhow::{Context, Result};
@@ -87,18 +88,26 @@ impl<'a> ElboLoss<'a> {
         Ok((terms.loss, means))
     }
 
-    /// The ELBO of held-out blocks, always the same ones, with the last weight of the KL; none where no held-out episode has room for one.
+    /// The ELBO of held-out blocks and its parts, always of the same ones, with the last weight of the KL; nothing where no held-out episode
+    /// has room for one.
     ///
     /// # Errors
     /// If a tensor operation fails.
-    pub fn held_out(&self, networks: &Networks) -> Result<Option<f64>> {
+    pub fn held_out(&self, networks: &Networks) -> Result<Scalars> {
         let (episodes, shape) = (&self.task.split.held_out, BlockShape { batch: HELD_OUT_BLOCKS, ..self.shape.clone() });
         let places = shape.places(episodes);
         if places.is_empty() {
-            return Ok(None);
+            return Ok(Vec::new());
         }
         let batch = blocks(episodes, &places, &shape, &mut Philox::new(HELD_OUT_SEED))?;
-        let (loss, _) = self.evaluate(networks, &batch, self.config.kl_weight.end)?;
-        Ok(Some(f64::from(loss.to_scalar::<f32>()?)))
+        let (_, means) = self.evaluate(networks, &batch, self.config.kl_weight.end)?;
+        let held_out = |name| match name {
+            "elbo" => "held_out_elbo",
+            "state_error" => "held_out_state_error",
+            "reward_error" => "held_out_reward_error",
+            "action_error" => "held_out_action_error",
+            _ => "held_out_kl",
+        };
+        Ok(means.into_iter().map(|mean| (held_out(mean.name), mean.sum)).collect())
     }
 }

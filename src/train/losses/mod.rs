@@ -103,8 +103,8 @@ impl<'a> Objective<'a> {
             let errors = denoise.held_out_errors(networks)?;
             scalars.push(("held_out_loss", errors.iter().sum::<f64>() / errors.len() as f64));
         }
-        if let Some(loss) = self.elbo.as_ref().map(|elbo| elbo.held_out(networks)).transpose()?.flatten() {
-            scalars.push(("held_out_elbo", loss));
+        if let Some(elbo) = &self.elbo {
+            scalars.extend(elbo.held_out(networks)?);
         }
         if let Some(context_free) = &self.context_free {
             scalars.push(("held_out_context_free", context_free.held_out(networks)?));
