@@ -29,7 +29,8 @@ pub fn sentence(held_out: &Scalars, beside_baseline: bool, probe: Option<&Probed
     if explained.is_empty() && probe.is_none() {
         return "what is hidden: not known, since the data tell no infos/context; model.latent.baseline would tell what the latent explains".into();
     }
-    let poor = probe.is_some_and(|probe| probe.filter > POOR) || (!explained.is_empty() && explained.iter().all(|(_, share)| *share < LITTLE));
+    let poor =
+        probe.is_some_and(|probe| probe.filter > POOR) || (!explained.is_empty() && explained.iter().all(|(_, share)| *share < LITTLE));
     match (poor, beside_baseline) {
         (false, _) => text,
         (true, false) => text + ". That is little: try model.latent.baseline first",
