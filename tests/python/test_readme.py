@@ -44,7 +44,7 @@ PORT_FLAGS = {"ada-rollout": "--url 127.0.0.1:7777", "ada-evaluate": "--url 127.
 IN_FULL = ("docs/simulator.md",)
 """Documents whose commands are small enough to be run to their end, so that what they promise comes out."""
 
-SHORT_RECIPES = [(r"^steps = \d+", "steps = 2"), (r"^(filter|successor_state) = \S+", r"\1 = 1000.0")]
+SHORT_RECIPES = [(r"^steps = \d+", "steps = 2"), (r"\b(filter|successor_state) = [\d.]+", r"\1 = 1000.0")]
 """Replaced in every recipe: two steps of training, and a gate that lets them pass."""
 
 GIVEN = {
