@@ -34,7 +34,7 @@ pub fn sentence(held_out: &Scalars, beside_baseline: bool, probe: Option<&Probed
     match (poor, beside_baseline) {
         (false, _) => text,
         (true, false) => text + ". That is little: try model.latent.baseline first",
-        (true, true) => text + ". That is little: try a longer look first (model.latent.looks = \"running\"), then more steps",
+        (true, true) => text + ". That is little: try a longer look (model.latent.looks; \"running\" is the longest) or more steps",
     }
 }
 
@@ -49,7 +49,7 @@ mod tests {
         let found = sentence(&errors(0.58), true, Some(&probe(0.134)));
         assert!(found.contains("42 % in states, 36 % in actions (held-out episodes); a linear probe"), "{found}");
         assert!(found.contains("an error of 0.134") && !found.contains("little"), "{found}");
-        assert!(sentence(&errors(0.58), true, Some(&probe(0.9))).ends_with("then more steps"));
+        assert!(sentence(&errors(0.58), true, Some(&probe(0.9))).ends_with("or more steps"));
         assert!(sentence(&errors(1.2), false, Some(&probe(0.9))).ends_with("try model.latent.baseline first"));
         assert!(sentence(&vec![("held_out_state_error", 0.99)], true, None).contains("1 % in states"));
         assert!(sentence(&vec![("held_out_state_error", 0.99)], true, None).contains("That is little"));

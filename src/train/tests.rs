@@ -198,6 +198,9 @@ fn a_baseline_asks_for_its_stage() {
     assert!(refused(&["stages.identify.trains.baseline=1.0"]).contains("`stages.identify.trains.baseline`: needs model.latent.baseline"));
     assert!(refused(&["stages.identify.trains.denoiser=1.0"]).contains("is not reached by any loss"));
     assert!(refused(&["stages.identify.minimizes.context_free=1.0"]).contains("needs [losses.context_free]"));
+    assert!(refused(&["stages.denoise.trains={latent = 1.0}"]).contains("train no denoiser"));
+    let idle = ["stages.identify.trains={latent = 0.0}", "stages.denoise.trains={denoiser = 1.0}"];
+    assert!(refused(&idle).contains("train no latent"));
     assert!(refused(&["model.latent.looks=running"]).contains("`model.latent.looks`: running takes chunks of one action"));
     let dir = tempfile::tempdir().unwrap();
     let again = Recipe { stages: beside_a_baseline(dir.path()).stages.into_iter().rev().collect(), ..beside_a_baseline(dir.path()) };

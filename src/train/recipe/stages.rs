@@ -161,5 +161,8 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
     let Some(last) = last else { return require(false, "stages", "are missing: at least one must minimize denoise") };
     let key = |field: &str| format!("stages.{}.{field}", last.name);
     require(last.weight(Loss::Denoise) > 0.0, key("minimizes.denoise"), "must be above 0 in the last stage, whose weights are shipped")?;
+    let learns = |group: Group| recipe.stages.iter().any(|stage| stage.trains.get(&group).is_some_and(|factor| *factor > 0.0));
+    require(learns(Group::Denoiser), "stages", "train no denoiser, and a checkpoint of random weights would be shipped")?;
+    require(recipe.model.latent.gru().is_none() || learns(Group::Latent), "stages", "train no latent, but model.latent asks for it")?;
     require(last.gate.is_none(), key("gate"), "opens the way to another stage, and this is the last")
 }
