@@ -9,7 +9,7 @@ use ada_diffuser::model::{
     denoiser::Given,
     diffusion::refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
     latent::Tokens,
-    method::{Backbone, Future, GruLatent, Looks},
+    method::{Backbone, GruLatent, Looks},
     nn::{Activations, Buffer, Params},
     noise::Philox,
     options::SamplerOptions,
@@ -23,7 +23,7 @@ const STATE: usize = 17;
 const ACTION: usize = 6;
 
 fn config(backbone: Backbone) -> ModelConfig {
-    let latent = GruLatent { dim: 20, hidden: 64, looks: Looks::Block(10), future: Future::Prior, baseline: None };
+    let latent = GruLatent::plain(20, 64, Looks::Block(10));
     let mut config = ModelConfig::plain(Layout { state_dim: STATE, action_dim: ACTION }, Some(latent), backbone);
     (config.method.plan.horizon, config.method.plan.level_max) = (T, 150);
     config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };

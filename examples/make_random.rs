@@ -10,7 +10,7 @@ use ada_diffuser::model::{
     checkpoint,
     config::{Defaults, ModelConfig, Restart},
     method::Backbone,
-    method::{Future, GruLatent, Looks},
+    method::{GruLatent, Looks},
     options::SamplerOptions,
     trajectory::Layout,
 };
@@ -82,13 +82,7 @@ impl Flags {
             Net::Dit => Backbone::Dit { width: self.width, depth: self.depth, heads: self.heads },
         };
         let looks = Looks::Block(self.block_len);
-        let latent = (self.latent_dim > 0).then_some(GruLatent {
-            dim: self.latent_dim,
-            hidden: self.hidden,
-            looks,
-            future: Future::Prior,
-            baseline: None,
-        });
+        let latent = (self.latent_dim > 0).then_some(GruLatent::plain(self.latent_dim, self.hidden, looks));
         let layout = Layout { state_dim: self.state_dim, action_dim: self.action_dim };
         let mut config = ModelConfig::plain(layout, latent, backbone);
         (config.method.plan.horizon, config.method.plan.level_max) = (self.plan_horizon, self.level_max);

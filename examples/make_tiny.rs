@@ -7,7 +7,7 @@ mod random_weights;
 
 use ada_diffuser::model::{
     config::ModelConfig,
-    method::{Backbone, Future, GruLatent, Looks},
+    method::{Backbone, GruLatent, Looks},
     trajectory::Layout,
 };
 use std::path::Path;
@@ -16,10 +16,7 @@ const SEED: u64 = 7;
 
 fn main() -> anyhow::Result<()> {
     let layout = Layout { state_dim: 4, action_dim: 2 };
-    let (latent, backbone) = (
-        GruLatent { dim: 6, hidden: 32, looks: Looks::Block(4), future: Future::Prior, baseline: None },
-        Backbone::Unet { widths: vec![8, 16, 16] },
-    );
+    let (latent, backbone) = (GruLatent::plain(6, 32, Looks::Block(4)), Backbone::Unet { widths: vec![8, 16, 16] });
     let mut config = ModelConfig::plain(layout, Some(latent), backbone);
     config.method.plan.clip = 10.0;
     config.trained.sub_steps = vec![1, 2, 3, 5];

@@ -8,7 +8,7 @@ use ada_diffuser::model::{
     Networks,
     config::ModelConfig,
     denoiser::{Denoiser, Given},
-    method::{Backbone, Future, GruLatent, Looks},
+    method::{Backbone, GruLatent, Looks},
     nn::{Activations, Buffer, Form, Layer, Params, Precision},
     noise::Philox,
     trajectory::Layout,
@@ -113,7 +113,7 @@ fn config(flags: &Flags) -> ModelConfig {
         Net::Unet => Backbone::Unet { widths: flags.widths.clone() },
         Net::Dit => Backbone::Dit { width: flags.width, depth: flags.depth, heads: flags.width / 32 },
     };
-    let latent = GruLatent { dim: LATENT, hidden: 64, looks: Looks::Block(4), future: Future::Prior, baseline: None };
+    let latent = GruLatent::plain(LATENT, 64, Looks::Block(4));
     let mut config = ModelConfig::plain(LAYOUT, Some(latent), backbone);
     (config.method.plan.horizon, config.method.plan.level_max) = (flags.len, LEVELS);
     config

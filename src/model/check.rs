@@ -88,12 +88,18 @@ impl ModelConfig {
             Schedule::Uniform { steps } => size("method.plan.schedule.steps", *steps, *level_max)?,
         }
         if let Some(gru) = latent.gru() {
-            let GruLatent { dim, hidden, looks: _, future: _, baseline } = gru;
+            let GruLatent { dim, hidden, looks: _, future, stays, baseline, actions: _ } = gru;
             size("method.latent.dim", *dim, WIDTH_MAX)?;
             size("method.latent.hidden", *hidden, WIDTH_MAX)?;
             if let Some(Baseline { width }) = baseline {
                 size("method.latent.baseline.width", *width, WIDTH_MAX)?;
             }
+            let moves = *future == Future::Held || *stays < *dim;
+            require(
+                *stays <= *dim && moves,
+                "method.latent.stays",
+                format!("is {stays}, must be below dim ({dim}), or dim where future = held"),
+            )?;
             match gru.looks {
                 Looks::Block(len) => size("method.latent.looks", len, HISTORY_MAX)?,
                 Looks::Running => {

@@ -38,9 +38,38 @@ pub struct GruLatent {
     /// What the latents of later steps are.
     #[serde(default)]
     pub future: Future,
+    /// Leading columns that stay as they are through an episode: no prior moves them, and in training one belief has to explain a whole
+    /// sequence by them. The others move from step to step.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub stays: usize,
     /// What needs no context; the latent explains the rest. Absent: it explains all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub baseline: Option<Baseline>,
+    /// Whether actions tell of what is hidden.
+    #[serde(default, skip_serializing_if = "Actions::are_evidence")]
+    pub actions: Actions,
+}
+
+fn is_zero(number: &usize) -> bool {
+    *number == 0
+}
+
+/// What actions tell an encoder. Those of the data were chosen by an expert that may have seen the context; the agent's own follow its own
+/// belief, and a filter that takes them for news deludes itself.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Actions {
+    /// Each is a part of its token, as is how far it is from what was expected.
+    #[default]
+    Evidence,
+    /// None is seen but by the baseline, which says what a state was to be after it.
+    Unseen,
+}
+
+impl Actions {
+    fn are_evidence(&self) -> bool {
+        *self == Self::Evidence
+    }
 }
 
 /// Models without a context, f0(s, a) of the state change and the reward and g0(s) of the action: the encoder sees how far off they are, and
@@ -171,6 +200,11 @@ impl Looks {
 }
 
 impl GruLatent {
+    /// The latent of the paper: all of it moves by a learned prior, explains all, and sees all.
+    pub fn plain(dim: usize, hidden: usize, looks: Looks) -> Self {
+        Self { dim, hidden, looks, future: Future::Prior, stays: 0, baseline: None, actions: Actions::Evidence }
+    }
+
     /// Width of the state that goes on from act to act; 0 where each looks anew.
     pub fn memory_len(&self) -> usize {
         match self.looks {

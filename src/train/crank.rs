@@ -6,8 +6,11 @@ use super::{
     learner::Learner,
     log::Log,
     losses::{Objective, context_free::measure_surprises},
-    recipe::{losses::Loss, stages::Stage},
-    resume::Store,
+    recipe::{
+        losses::Loss,
+        stages::{Keeps, Stage},
+    },
+    resume::{Kept, Store},
     ship::{self, Product},
 };
 use anyhow::{Result, bail};
@@ -59,6 +62,9 @@ impl Crank<'_> {
                 self.log.say(&format!("checkpoint in {}: {:#}", self.out.display(), product.metrics()));
                 return Ok(Outcome::Finished);
             }
+            if let Some(Kept { step, score }) = learner.take_kept()? {
+                self.log.say(&format!("{} hands on the weights of step {step}, measured at {score:.4}", self.stage(learner).name));
+            }
             if self.stage(learner).weight(Loss::ContextFree) > 0.0 {
                 measure_surprises(self.task, &learner.networks, &learner.vars)?;
             }
@@ -97,6 +103,9 @@ impl Crank<'_> {
             }
             learner.position.step += 1;
             self.log.step(&learner.position, task.recipe.log_every, &scalars)?;
+            if self.stage(learner).keeps.is_due(learner.position.step, steps) {
+                self.keep_if_best(&objective, learner)?;
+            }
             if learner.position.step.is_multiple_of(task.recipe.checkpoint_every) || learner.position.step == steps {
                 self.measure(&objective, learner)?;
                 self.store.save(&learner.snapshot())?;
@@ -115,6 +124,18 @@ impl Crank<'_> {
         self.log.write(&learner.position, &[("held_out_loss", product.held_out_loss)])?;
         self.finished = Some(product);
         Ok(())
+    }
+
+    /// Weights of a stage that hands on its best ones are measured, and kept if they are.
+    fn keep_if_best(&mut self, objective: &Objective, learner: &mut Learner) -> Result<()> {
+        let score = match (self.stage(learner).keeps, &learner.networks.latent) {
+            (Keeps::Last, _) | (Keeps::LeastProbe(_), None) => None,
+            (Keeps::LeastHeldOut(_), _) => objective.score(&objective.held_out(&learner.networks)?),
+            (Keeps::LeastProbe(_), Some(latent)) => Some(gate::probe(self.task, latent)?.filter),
+        };
+        let Some(score) = score else { return Ok(()) };
+        learner.keep_if_best(score)?;
+        self.log.write(&learner.position, &[("keeps_least", score)])
     }
 
     /// Judges a stage that looked for the latent, by a probe where the data have a context; without a gate everything passes.

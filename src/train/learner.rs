@@ -5,7 +5,7 @@ use super::{
     optimizer::{Adam, Ema},
     position::Position,
     recipe::stages::{Group, Stage},
-    resume::{Notes, Snapshot, State, restore_vars},
+    resume::{KEPT, Kept, Notes, Snapshot, State, restore_vars},
 };
 use crate::model::{Networks, nn::params::Params};
 use anyhow::{Result, ensure};
@@ -28,6 +28,8 @@ pub struct Learner {
     pub adam: Adam,
     /// Average of all variables, if the stage keeps one.
     pub ema: Option<Ema>,
+    /// The best weights so far, of a stage that hands those on ([`Notes::kept`]); else none.
+    kept: BTreeMap<String, Tensor>,
     /// How far.
     pub position: Position,
     /// What the run has found out so far.
@@ -44,7 +46,7 @@ impl Learner {
         let networks = Networks::new(task.config.layout, &task.config.method, &params)?;
         let vars = params.vars();
         let (adam, ema) = equip(&task.recipe.stages[position.stage], &vars)?;
-        Ok(Self { networks, vars, adam, ema, position, notes: Notes::default() })
+        Ok(Self { networks, vars, adam, ema, kept: BTreeMap::new(), position, notes: Notes::default() })
     }
 
     /// The learner of a state on disk.
@@ -60,7 +62,33 @@ impl Learner {
             ema.restore(&state.tensors)?;
         }
         learner.notes = state.notes;
+        let kept = state.tensors.into_iter().filter_map(|(name, tensor)| Some((name.strip_prefix(KEPT)?.to_string(), tensor)));
+        learner.kept = kept.collect();
         Ok(learner)
+    }
+
+    /// Keeps these weights if none so far had a lower score; a score that is no number never has.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn keep_if_best(&mut self, score: f64) -> Result<()> {
+        if score.is_nan() || self.notes.kept.is_some_and(|kept| kept.score <= score) {
+            return Ok(());
+        }
+        self.notes.kept = Some(Kept { step: self.position.step, score });
+        // A copy: the optimizer works in place.
+        self.kept = self.vars.iter().map(|(name, var)| Ok((name.clone(), var.copy()?))).collect::<Result<_>>()?;
+        Ok(())
+    }
+
+    /// Takes up the weights that were kept, if any were, and tells which.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn take_kept(&mut self) -> Result<Option<Kept>> {
+        let kept = std::mem::take(&mut self.kept);
+        kept.iter().filter_map(|(name, tensor)| Some((self.vars.get(name)?, tensor))).try_for_each(|(var, tensor)| var.set(tensor))?;
+        Ok(self.notes.kept.take())
     }
 
     /// Goes on to the next stage with the weights as they are.
@@ -78,14 +106,21 @@ impl Learner {
     /// # Errors
     /// If the networks cannot be built from the recipe.
     pub fn begin_anew(&mut self, task: &Task) -> Result<()> {
-        let notes = std::mem::take(&mut self.notes);
+        let notes = Notes { kept: None, ..std::mem::take(&mut self.notes) };
         *self = Self { notes, ..Self::fresh(task, self.position.next_attempt())? };
         Ok(())
     }
 
     /// What is to be saved.
     pub fn snapshot(&self) -> Snapshot<'_> {
-        Snapshot { position: self.position, notes: &self.notes, vars: &self.vars, adam: &self.adam, ema: self.ema.as_ref() }
+        Snapshot {
+            position: self.position,
+            notes: &self.notes,
+            vars: &self.vars,
+            adam: &self.adam,
+            ema: self.ema.as_ref(),
+            kept: &self.kept,
+        }
     }
 
     /// The averaged networks and their tensors: what is shipped.

@@ -102,8 +102,8 @@ impl Task {
         let mut dataset = hdf5::read(&recipe.data, room)?;
         let (len, why) = recipe.episode_len_min();
         dataset.leave_out_shorter(len, &why)?;
-        if recipe.gate().is_some() {
-            ensure!(dataset.context_dim() > 0, "recipe: `gate`: {} has no `infos/context` to probe for", recipe.data.display());
+        if let Some(key) = recipe.probe_key() {
+            ensure!(dataset.context_dim() > 0, "recipe: `{key}`: {} has no `infos/context` to probe for", recipe.data.display());
         }
         let (layout, notes, dataset_digest) = (dataset.layout(), std::mem::take(&mut dataset.notes), dataset.digest.clone());
         let (split, action_columns) = dataset.split(UnitsFrom::Data(&recipe.actions))?;
@@ -111,11 +111,11 @@ impl Task {
         // The recipe was checked with plain units; now the data's are known.
         config.check().with_context(|| format!("data set {} makes no model", recipe.data.display()))?;
         let task = Self { recipe, split, action_columns, dataset_digest, config, notes };
-        if task.recipe.gate().is_some() {
+        if let Some(key) = task.recipe.probe_key() {
             ensure!(
                 gate::contexts_vary(&task)?,
-                "recipe: `gate`: in the held-out episodes of {} `infos/context` never changes, so an error in units of its variance is no \
-                 number; record episodes with other contexts, or leave the gate out",
+                "recipe: `{key}`: in the held-out episodes of {} `infos/context` never changes, so an error in units of its variance is no \
+                 number; record episodes with other contexts, or leave the key out",
                 task.recipe.data.display()
             );
         }

@@ -20,6 +20,8 @@ use std::{
 
 const FILE: &str = "state.safetensors";
 const KEY: &str = "training";
+/// How names of weights begin that a stage will hand on.
+pub const KEPT: &str = "kept.";
 
 /// What a state belongs to.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -49,6 +51,18 @@ pub struct Notes {
     pub changes: Vec<Change>,
     /// Least held-out loss of the last stage, where the best checkpoint is kept.
     pub best: Option<f64>,
+    /// Of this stage the best measurement so far, where its weights are kept.
+    #[serde(default)]
+    pub kept: Option<Kept>,
+}
+
+/// A measurement of a stage that hands on its best weights.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Kept {
+    /// After so many steps.
+    pub step: usize,
+    /// What was measured; less is better.
+    pub score: f64,
 }
 
 /// A state read from disk.
@@ -59,7 +73,7 @@ pub struct State {
     pub notes: Notes,
     /// Steps that the optimizer has counted.
     pub adam_steps: u64,
-    /// `var.NAME`, `m.NAME`, `v.NAME`, `ema.NAME`.
+    /// `var.NAME`, `m.NAME`, `v.NAME`, `ema.NAME`, `kept.NAME`.
     pub tensors: BTreeMap<String, Tensor>,
 }
 
@@ -75,6 +89,8 @@ pub struct Snapshot<'a> {
     pub adam: &'a Adam,
     /// Their average, if the stage keeps one.
     pub ema: Option<&'a Ema>,
+    /// The best of them so far, of a stage that hands those on; [`Notes::kept`] tells which.
+    pub kept: &'a BTreeMap<String, Tensor>,
 }
 
 /// The state of one run in its directory.
@@ -125,6 +141,7 @@ impl Store {
         let mut tensors: BTreeMap<String, Tensor> = BTreeMap::new();
         let adam_steps = snapshot.adam.save(&mut tensors)?;
         tensors.extend(snapshot.vars.iter().map(|(name, var)| (format!("var.{name}"), var.as_tensor().clone())));
+        tensors.extend(snapshot.kept.iter().map(|(name, tensor)| (format!("{KEPT}{name}"), tensor.clone())));
         if let Some(ema) = snapshot.ema {
             tensors.extend(ema.tensors(snapshot.vars)?.into_iter().map(|(name, tensor)| (format!("ema.{name}"), tensor)));
         }

@@ -28,7 +28,7 @@ const STEPS: usize = 24;
 const BATCH: usize = 16;
 
 fn config(latent: Option<(Looks, Future)>, schedule: Schedule, obs_horizon: usize, sub_steps: usize) -> ModelConfig {
-    let latent = latent.map(|(looks, future)| GruLatent { dim: 5, hidden: 16, looks, future, baseline: None });
+    let latent = latent.map(|(looks, future)| GruLatent { future, ..GruLatent::plain(5, 16, looks) });
     let mut config = ModelConfig::plain(LAYOUT, latent, Backbone::Unet { widths: vec![8, 16] });
     (config.method.plan.schedule, config.method.plan.obs_horizon) = (schedule, obs_horizon);
     config.trained.sub_steps = vec![sub_steps];

@@ -258,7 +258,7 @@ fn a_gate_on_constant_contexts_says_so() {
         "stages.identify.gate.tries=4",
     ];
     let error = Task::new(recipe_with(&gate).unwrap(), &Room::default()).err().unwrap().to_string();
-    assert!(error.contains("`gate`") && error.contains("never changes"), "{error}");
+    assert!(error.contains("`stages.identify.gate`") && error.contains("never changes"), "{error}");
 }
 
 #[test]

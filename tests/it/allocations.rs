@@ -6,7 +6,7 @@ use ada_diffuser::model::{
     agent::{Act, Agent, Episode, Observation, Start},
     config::{ModelConfig, Restart},
     method::Backbone,
-    method::{Future, GruLatent, Looks},
+    method::{GruLatent, Looks},
     nn::Params,
     options::{LatentMode, SamplerOptions},
     trajectory::Layout,
@@ -45,7 +45,7 @@ fn asked_during(work: impl FnOnce()) -> usize {
 }
 
 fn agent(backbone: Backbone, obs_horizon: usize) -> Agent {
-    let latent = GruLatent { dim: 5, hidden: 16, looks: Looks::Block(4), future: Future::Prior, baseline: None };
+    let latent = GruLatent::plain(5, 16, Looks::Block(4));
     let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, Some(latent), backbone);
     config.method.plan.obs_horizon = obs_horizon;
     // Every warm act is noised again a little.

@@ -24,7 +24,7 @@ fn options() -> SamplerOptions {
 }
 
 fn agent(latents: bool, obs_horizon: usize, denoiser: Backbone) -> Agent {
-    let latent = latents.then_some(GruLatent { dim: 5, hidden: 16, looks: Looks::Block(4), future: Future::Prior, baseline: None });
+    let latent = latents.then_some(GruLatent::plain(5, 16, Looks::Block(4)));
     let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, latent, denoiser);
     config.units.normalizer.state = Affine { mean: vec![0.5, 0.0, -0.5], std: vec![2.0, 1.0, 0.5] };
     config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };

@@ -2,7 +2,7 @@
 
 use crate::model::{
     config::{Defaults, Missing, ModelConfig, Restart, Trained, Units},
-    method::{Backbone, Diffusion, Future, GruLatent, LatentSource, Looks, Method, Schedule},
+    method::{Backbone, Diffusion, GruLatent, LatentSource, Looks, Method, Schedule},
     normalizer::Normalizer,
     options::SamplerOptions,
     trajectory::Layout,
@@ -54,9 +54,7 @@ struct LatentV1 {
 impl From<ConfigV1> for ModelConfig {
     fn from(old: ConfigV1) -> Self {
         let with = |beside: Vec<usize>, default: usize| beside.into_iter().chain([default]).collect::<BTreeSet<_>>().into_iter().collect();
-        let gru = |LatentV1 { dim, hidden }| {
-            LatentSource::Gru(GruLatent { dim, hidden, looks: Looks::Block(old.block_len), future: Future::Prior, baseline: None })
-        };
+        let gru = |LatentV1 { dim, hidden }| LatentSource::Gru(GruLatent::plain(dim, hidden, Looks::Block(old.block_len)));
         let plan = Diffusion {
             horizon: old.plan_horizon,
             obs_horizon: old.obs_horizon,

@@ -4,7 +4,7 @@ use super::*;
 use crate::model::{
     config::ModelConfig,
     golden::Golden,
-    method::{Future, GruLatent, Looks},
+    method::{GruLatent, Looks},
     nn::{Buffer, Precision, kernels::testing::with_each_isa},
     noise::Philox,
     trajectory::Layout,
@@ -18,7 +18,7 @@ const LEN: usize = 8;
 const OBSERVED: usize = 10;
 
 fn config(backbone: Backbone) -> ModelConfig {
-    let latent = GruLatent { dim: LATENT, hidden: 8, looks: Looks::Block(4), future: Future::Prior, baseline: None };
+    let latent = GruLatent::plain(LATENT, 8, Looks::Block(4));
     let mut config = ModelConfig::plain(LAYOUT, Some(latent), backbone);
     config.method.plan.obs_horizon = 3;
     config
@@ -111,7 +111,7 @@ fn golden_config(case: &str) -> ModelConfig {
         "dit_latents" => (dit(6, 3, 3), 3, 1),
         _ => (dit(4, 0, 2), 0, 1),
     };
-    let latent = (dim > 0).then_some(GruLatent { dim, hidden: 8, looks: Looks::Block(4), future: Future::Prior, baseline: None });
+    let latent = (dim > 0).then_some(GruLatent::plain(dim, 8, Looks::Block(4)));
     let mut config = ModelConfig::plain(LAYOUT, latent, backbone);
     config.method.plan.obs_horizon = obs_horizon;
     config

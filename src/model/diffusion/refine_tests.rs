@@ -3,7 +3,7 @@
 use super::*;
 use crate::model::{
     config::ModelConfig,
-    method::{Backbone, Future, GruLatent, Looks},
+    method::{Backbone, GruLatent, Looks},
     method::{LatentSource, Schedule},
     nn::params::Params,
     noise::Philox,
@@ -18,7 +18,7 @@ const STATE: usize = 3;
 
 fn config() -> ModelConfig {
     let layout = Layout { state_dim: STATE, action_dim: DIM - STATE };
-    let latent = GruLatent { dim: 4, hidden: 8, looks: Looks::Block(3), future: Future::Prior, baseline: None };
+    let latent = GruLatent::plain(4, 8, Looks::Block(3));
     let mut config = ModelConfig::plain(layout, Some(latent), Backbone::Dit { width: 16, depth: 1, heads: 2 });
     (config.method.plan.horizon, config.method.plan.level_max) = (LEN, 20);
     config

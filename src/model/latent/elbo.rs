@@ -17,6 +17,9 @@ pub struct ElboBatch {
     pub successor_shown: Tensor,
     /// `(B, L - 1, dim)` Gaussian draws of the latents.
     pub eps: Tensor,
+    /// `(B, 1, L - 1)`: 1 at the step whose belief has to explain the whole row by the columns that stay, before the last step; of a latent
+    /// that has such columns.
+    pub believed: Option<Tensor>,
 }
 
 /// Settings of the loss.
@@ -104,7 +107,7 @@ impl LatentModel {
         let surprises = self.surprises(&batch.tokens)?;
         let Explained { q, from } = self.explained(surprises.as_ref(), batch)?;
         let (steps, valid) = (len - 1 - from, batch.valid.narrow(1, from, len - 1 - from)?);
-        let latent = q.sample(&batch.eps.narrow(1, from, steps)?)?;
+        let (latent, stays) = self.drawn(&q, batch, from)?;
         let aims = Aims::new(&batch.tokens, surprises.as_ref(), from, options)?;
         let now = batch.tokens.narrow(from, steps)?;
         let told = self.decoder.predict(&now.state, &now.action, &latent)?;
@@ -118,7 +121,7 @@ impl LatentModel {
         let state_error = error(told.state, &aims.state)?;
         let reward_error = error(told.reward, &aims.reward)?;
         let action_error = told.action.zip(aims.action).map(|(told, aim)| error(told, &aim)).transpose()?;
-        let kl = self.block_kl(&q, &valid, options.free_bits)?;
+        let kl = self.block_kl(&q, stays.as_ref(), &valid, options.free_bits)?;
         let weighted = |error: &Tensor, weight: f64| if weight == 1.0 { Ok(error.clone()) } else { error.affine(weight, 0.0) };
         let mut rec = (weighted(&state_error, options.state_weight * half(now.state.dim(2)?))?
             + reward_error.affine(options.reward_weight * half(1), 0.0)?)?;
@@ -143,18 +146,49 @@ impl LatentModel {
         Ok(Explained { q: beliefs.narrow(0, steps)?, from: 1 })
     }
 
-    /// KL to the prior of each step but the first, or of a held belief to N(0, I); what of a step is below `free` counts as that.
-    fn block_kl(&self, q: &Gaussian, valid: &Tensor, free: f64) -> Result<Tensor> {
-        let paid = |kl: Tensor| if free > 0.0 { kl.maximum(free) } else { Ok(kl) };
-        let Some(prior) = &self.prior else {
-            let standard = Gaussian { mean: q.mean.zeros_like()?, log_var: q.mean.zeros_like()? };
-            return (paid(q.kl(&standard)?)? * valid)?.sum_all()? / valid.sum_all()?;
+    /// A draw of the latents, and of the columns that stay the one belief of each row, `(B, 1, stays)`, that all of its steps share: what
+    /// does not change has to explain a whole sequence, of which one step tells too little to pay for its bits.
+    fn drawn(&self, q: &Gaussian, batch: &ElboBatch, from: usize) -> Result<(Tensor, Option<Gaussian>)> {
+        let (_, steps, dim) = q.mean.dims3()?;
+        let eps = batch.eps.narrow(1, from, steps)?;
+        let Some(believed) = &batch.believed else { return Ok((q.sample(&eps)?, None)) };
+        let believed = believed.narrow(2, 0, steps)?.contiguous()?;
+        let all = q.columns(0, self.stays)?;
+        let belief = Gaussian { mean: believed.matmul(&all.mean)?, log_var: believed.matmul(&all.log_var)? };
+        let held = belief.sample(&eps.narrow(1, 0, 1)?.narrow(2, 0, self.stays)?)?;
+        let held = held.broadcast_as((eps.dim(0)?, steps, self.stays))?;
+        let moves = dim - self.stays;
+        let latent = match moves {
+            0 => held.contiguous()?,
+            _ => Tensor::cat(&[&held, &q.columns(self.stays, moves)?.sample(&eps.narrow(2, self.stays, moves)?)?], 2)?,
         };
-        let steps = q.mean.dim(1)?;
-        let prior = prior.predict(&q.narrow(0, steps - 1)?)?;
-        let valid = valid.narrow(1, 1, steps - 1)?;
-        let kl = (paid(q.narrow(1, steps - 1)?.kl(&prior)?)? * &valid)?.sum_all()?;
-        kl / valid.sum_all()?
+        Ok((latent, Some(belief)))
+    }
+
+    /// KL to the prior of each step but the first, or of a held belief to N(0, I); what of a step is below `free` counts as that. The columns
+    /// that stay pay once for all steps of a row.
+    fn block_kl(&self, q: &Gaussian, stays: Option<&Gaussian>, valid: &Tensor, free: f64) -> Result<Tensor> {
+        let paid = |kl: Tensor| if free > 0.0 { kl.maximum(free) } else { Ok(kl) };
+        let mean = |kl: Tensor, valid: &Tensor| -> Result<Tensor> { (paid(kl)? * valid)?.sum_all()? / valid.sum_all()? };
+        let once = |belief: &Gaussian| -> Result<Tensor> { paid(belief.kl(&belief.standard()?)?)?.sum_all()? / valid.sum_all()? };
+        let (steps, moves) = (q.mean.dim(1)?, q.mean.dim(2)? - self.stays);
+        let moved = |q: Gaussian| if self.stays == 0 { Ok(q) } else { q.columns(self.stays, moves) };
+        let each = match &self.prior {
+            _ if moves == 0 => None,
+            None => {
+                let q = moved(q.clone())?;
+                Some(mean(q.kl(&q.standard()?)?, valid)?)
+            }
+            Some(prior) => {
+                let prior = moved(prior.predict(&q.narrow(0, steps - 1)?)?)?;
+                Some(mean(moved(q.narrow(1, steps - 1)?)?.kl(&prior)?, &valid.narrow(1, 1, steps - 1)?)?)
+            }
+        };
+        match (each, stays.map(once).transpose()?) {
+            (Some(each), Some(once)) => each + once,
+            (Some(kl), None) | (None, Some(kl)) => Ok(kl),
+            (None, None) => candle_core::bail!("a latent that neither stays nor moves: is a bug"),
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::model::{
-    method::{Baseline, Future, GruLatent, Looks},
+    method::{Actions, Baseline, Future, GruLatent, Looks},
     nn::params::Params,
     noise::Philox,
     trajectory::{Layout, Token},
@@ -54,7 +54,14 @@ fn batch() -> ElboBatch {
         history_shown: Tensor::from_vec(shown, (BATCH, LEN, 3), &Device::Cpu).unwrap(),
         successor_shown: tensor(present, 3),
         eps: tensor(draw(BATCH * (LEN - 1) * DIM), DIM),
+        believed: None,
     }
+}
+
+/// The beliefs of steps 1, 2 and 0 have to explain the rows.
+fn batch_that_stays() -> ElboBatch {
+    let chosen = [1, 2, 0].iter().flat_map(|at| (0..LEN - 1).map(move |step| f32::from(step == *at))).collect();
+    ElboBatch { believed: Some(Tensor::from_vec(chosen, (BATCH, 1, LEN - 1), &Device::Cpu).unwrap()), ..batch() }
 }
 
 fn model_of(future: Future, params: &Params) -> LatentModel {
@@ -62,34 +69,52 @@ fn model_of(future: Future, params: &Params) -> LatentModel {
 }
 
 fn beside(baseline: Option<Baseline>, future: Future, params: &Params) -> LatentModel {
-    LatentModel::new(&GruLatent { dim: DIM, hidden: 7, looks: Looks::Block(4), future, baseline }, layout(), params).unwrap()
+    LatentModel::new(&GruLatent { future, baseline, ..GruLatent::plain(DIM, 7, Looks::Block(4)) }, layout(), params).unwrap()
 }
 
 fn model(params: &Params) -> LatentModel {
     model_of(Future::Prior, params)
 }
 
-fn loss(model: &LatentModel) -> f64 {
-    f64::from(model.elbo(&batch(), &options()).unwrap().loss.to_scalar::<f32>().unwrap())
+fn staying(stays: usize, baseline: Option<Baseline>, future: Future, params: &Params) -> LatentModel {
+    let latent = GruLatent { stays, future, baseline, ..GruLatent::plain(DIM, 7, Looks::Block(4)) };
+    LatentModel::new(&latent, layout(), params).unwrap()
 }
 
 /// Gradient of every parameter along a random direction.
 #[test]
 fn gradient_is_the_central_difference() {
-    [Future::Prior, Future::Held].into_iter().for_each(|future| check_gradient(None, future));
+    [(Future::Prior, 2), (Future::Held, 2)].into_iter().for_each(|(future, seed)| {
+        let params = Params::fresh(seed);
+        check_gradient(&params, &model_of(future, &params), &batch());
+    });
+}
+
+/// The same where columns stay: one of two, beside one that moves, and all of them.
+#[test]
+fn gradient_of_what_stays() {
+    // A seed whose numbers lie away from the kinks of the ReLUs.
+    for (stays, baseline, future) in
+        [(1, None, Future::Prior), (1, Some(Baseline { width: 5 }), Future::Prior), (1, None, Future::Held), (DIM, None, Future::Held)]
+    {
+        let params = Params::fresh(6);
+        check_gradient(&params, &staying(stays, baseline, future, &params), &batch_that_stays());
+    }
 }
 
 /// What the latent has to explain are the surprises themselves, so a baseline gets no gradient from there; all others do.
 #[test]
 fn gradient_beside_a_baseline() {
-    [Future::Prior, Future::Held].into_iter().for_each(|future| check_gradient(Some(Baseline { width: 5 }), future));
+    [Future::Prior, Future::Held].into_iter().for_each(|future| {
+        // Another seed, whose numbers lie away from the kinks as well.
+        let params = Params::fresh(5);
+        check_gradient(&params, &beside(Some(Baseline { width: 5 }), future, &params), &batch());
+    });
 }
 
-fn check_gradient(baseline: Option<Baseline>, future: Future) {
-    // Another seed beside a baseline, whose numbers lie away from the kinks as well.
-    let params = Params::fresh(if baseline.is_some() { 5 } else { 2 });
-    let model = beside(baseline, future, &params);
-    let grads = model.elbo(&batch(), &options()).unwrap().loss.backward().unwrap();
+fn check_gradient(params: &Params, model: &LatentModel, batch: &ElboBatch) {
+    let loss = || f64::from(model.elbo(batch, &options()).unwrap().loss.to_scalar::<f32>().unwrap());
+    let grads = model.elbo(batch, &options()).unwrap().loss.backward().unwrap();
     for (name, var) in params.vars().into_iter().filter(|(name, _)| !name.starts_with("baseline.")) {
         let mut stream = Philox::named(9, &name);
         let direction: Vec<f32> = (0..var.elem_count()).map(|_| stream.normal()).collect();
@@ -97,7 +122,7 @@ fn check_gradient(baseline: Option<Baseline>, future: Future) {
         let start = var.as_tensor().copy().unwrap();
         let at = |step: f64| {
             var.set(&(&start + direction.affine(step, 0.0).unwrap()).unwrap()).unwrap();
-            loss(&model)
+            loss()
         };
         let slopes = [3e-3, 1e-3, 3e-4, 1e-4].map(|step| (at(step) - at(-step)) / (2.0 * step));
         var.set(&start).unwrap();
@@ -239,5 +264,73 @@ fn places_of_one_episode() {
     for (row, t) in at.into_iter().enumerate() {
         let alone = model.infer_after(&model.past(&episode, Some(&[t])).unwrap(), &episode.narrow(t, 1).unwrap()).unwrap();
         assert_eq!(flat(&together.mean.narrow(0, row, 1).unwrap()), flat(&alone.mean), "{t}");
+    }
+}
+
+/// What stays is one number for a whole row, drawn from the belief of one step, and its KL is paid once: by hand, from the posteriors.
+#[test]
+fn what_stays_by_hand() {
+    let params = Params::fresh(2);
+    let model = staying(1, None, Future::Prior, &params);
+    let batch = batch_that_stays();
+    let q = model.posteriors(&batch.tokens, &batch.history_shown, &batch.successor_shown).unwrap();
+    let [mean, log_var] = [&q.mean, &q.log_var].map(|values| values.to_vec3::<f32>().unwrap());
+    let (latent, belief) = model.drawn(&q, &batch, 0).unwrap();
+    let (latent, eps) = (latent.to_vec3::<f32>().unwrap(), batch.eps.to_vec3::<f32>().unwrap());
+    let draw = |row: usize, step: usize, column: usize, eps: f32| mean[row][step][column] + (log_var[row][step][column] / 2.0).exp() * eps;
+    let mut once = 0.0;
+    for (row, at) in [1, 2, 0].into_iter().enumerate() {
+        for step in 0..LEN - 1 {
+            assert!((latent[row][step][0] - draw(row, at, 0, eps[row][0][0])).abs() < 1e-5);
+            assert!((latent[row][step][1] - draw(row, step, 1, eps[row][step][1])).abs() < 1e-5);
+        }
+        let (mean, log_var) = (mean[row][at][0], log_var[row][at][0]);
+        once += 0.5 * (log_var.exp() + mean * mean - 1.0 - log_var);
+    }
+    let kl = |stays: Option<&Gaussian>| model.block_kl(&q, stays, &batch.valid, 0.0).unwrap().to_scalar::<f32>().unwrap();
+    let steps = batch.valid.sum_all().unwrap().to_scalar::<f32>().unwrap();
+    assert!((kl(belief.as_ref()) - kl(None) - once / steps).abs() < 1e-5, "{} {} {once}", kl(belief.as_ref()), kl(None));
+}
+
+/// The prior leaves alone what stays, however far it looks.
+#[test]
+fn the_prior_moves_what_moves() {
+    let model = staying(1, None, Future::Prior, &Params::fresh(2));
+    let start = model.infer(&batch().tokens, None).unwrap();
+    let flat = |tensor: &Tensor, column: usize| tensor.narrow(2, column, 1).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    model
+        .roll_out(start.clone(), 3, |next| {
+            assert_eq!(flat(&next.mean, 0), flat(&start.mean, 0));
+            assert_eq!(flat(&next.log_var, 0), flat(&start.log_var, 0));
+            assert_ne!(flat(&next.mean, 1), flat(&start.mean, 1));
+            Ok(())
+        })
+        .unwrap();
+}
+
+/// Actions that are unseen move no belief by themselves: none without a baseline, with one only through what a state was to be after them.
+#[test]
+fn unseen_actions() {
+    for baseline in [None, Some(Baseline { width: 5 })] {
+        let latent = GruLatent { actions: Actions::Unseen, baseline, ..GruLatent::plain(DIM, 7, Looks::Block(4)) };
+        let model = LatentModel::new(&latent, layout(), &Params::fresh(2)).unwrap();
+        let flat = |tokens: &Tokens| {
+            let tokens = if baseline.is_some() { tokens.clone().following(None).unwrap() } else { tokens.clone() };
+            model.infer(&tokens, None).unwrap().mean.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        };
+        let (clean, mut moved) = (batch().tokens, batch().tokens);
+        // The last action has no successor that could tell of it; beside a baseline its reward has, which is hidden.
+        let keep = Tensor::new(&[1f32, 1.0, 0.0], &Device::Cpu).unwrap();
+        let hide = |tokens: &Tokens| Tokens { present: tokens.present.broadcast_mul(&keep).unwrap(), ..tokens.clone() };
+        let last =
+            Tensor::from_vec((0..BATCH * LEN * 2).map(|i| f32::from(i / 2 % LEN == LEN - 1)).collect(), (BATCH, LEN, 2), &Device::Cpu);
+        moved.action = (&moved.action + last.unwrap()).unwrap();
+        assert_eq!(flat(&hide(&clean)), flat(&hide(&moved)), "{baseline:?}");
+        let seen = LatentModel::new(&GruLatent { actions: Actions::Evidence, ..latent }, layout(), &Params::fresh(2)).unwrap();
+        let infer = |tokens: &Tokens| {
+            let tokens = hide(tokens).following(None).unwrap();
+            seen.infer(&tokens, None).unwrap().mean.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        };
+        assert_ne!(infer(&clean), infer(&moved));
     }
 }

@@ -1,8 +1,8 @@
 //! Tokens to posterior: embeddings, GRU and Gaussian head (appendix A.4 of the paper: Stage 1 networks).
 
-use super::{Before, Gaussian, Surprises, Tokens, gaussian::LOG_VAR};
+use super::{Gaussian, Surprises, Tokens, gaussian::LOG_VAR};
 use crate::model::{
-    method::GruLatent,
+    method::{Actions, GruLatent},
     nn::{
         Absent,
         Activation::Relu,
@@ -35,13 +35,40 @@ impl Part {
     }
 }
 
+/// What is embedded of tokens: state, action unless it is unseen, reward; or of how surprising each of these is.
+struct Parts {
+    state: Part,
+    action: Option<Part>,
+    reward: Part,
+}
+
+impl Parts {
+    fn new(layout: Layout, actions: Actions, params: &Params) -> Result<Self> {
+        let action = || Part::new(layout.action_dim, ACTION_WIDTH, &params.scope("action"));
+        Ok(Self {
+            state: Part::new(layout.state_dim, STATE_WIDTH, &params.scope("state"))?,
+            action: (actions == Actions::Evidence).then(action).transpose()?,
+            reward: Part::new(1, REWARD_WIDTH, &params.scope("reward"))?,
+        })
+    }
+
+    fn width(&self) -> usize {
+        STATE_WIDTH + REWARD_WIDTH + self.action.as_ref().map_or(0, |_| ACTION_WIDTH)
+    }
+
+    /// Embeddings, each where `told` (B, L, 3) says that it is known.
+    fn forward<V: Activations>(&self, [state, action, reward]: [&V; 3], told: &V) -> Result<[Option<V>; 3]> {
+        let part = |part: &Part, value: &V, index| part.forward(value, &told.channels(index, 1)?);
+        let action = self.action.as_ref().map(|of| part(of, action, 1)).transpose()?;
+        Ok([Some(part(&self.state, state, 0)?), action, Some(part(&self.reward, reward, 2)?)])
+    }
+}
+
 /// Embedding of a token, GRU over tokens, head from a GRU state to the posterior.
 pub struct Encoder {
-    state: Part,
-    action: Part,
-    reward: Part,
-    /// Of surprises in state, action and reward, beside a baseline.
-    surprise: Option<[Part; 3]>,
+    parts: Parts,
+    /// Of surprises, beside a baseline.
+    surprise: Option<Parts>,
     mlp: [Linear; 2],
     gru: Gru,
     mean: Linear,
@@ -50,20 +77,12 @@ pub struct Encoder {
 
 impl Encoder {
     pub(super) fn new(config: &GruLatent, layout: Layout, params: &Params) -> Result<Self> {
-        let parts = |params: &Params| -> Result<[Part; 3]> {
-            Ok([
-                Part::new(layout.state_dim, STATE_WIDTH, &params.scope("state"))?,
-                Part::new(layout.action_dim, ACTION_WIDTH, &params.scope("action"))?,
-                Part::new(1, REWARD_WIDTH, &params.scope("reward"))?,
-            ])
-        };
-        let surprise = config.baseline.map(|_| parts(&params.scope("surprise"))).transpose()?;
-        let width = (1 + usize::from(surprise.is_some())) * (STATE_WIDTH + ACTION_WIDTH + REWARD_WIDTH) + 1;
-        let [state, action, reward] = parts(params)?;
+        let of_surprises = |_| Parts::new(layout, config.actions, &params.scope("surprise"));
+        let surprise = config.baseline.map(of_surprises).transpose()?;
+        let parts = Parts::new(layout, config.actions, params)?;
+        let width = parts.width() + surprise.as_ref().map_or(0, Parts::width) + 1;
         Ok(Self {
-            state,
-            action,
-            reward,
+            parts,
             surprise,
             mlp: [Linear::new(width, TOKEN_WIDTH, &params.scope("mlp.0"))?, Linear::new(TOKEN_WIDTH, TOKEN_WIDTH, &params.scope("mlp.2"))?],
             gru: Gru::new(TOKEN_WIDTH, config.hidden, &params.scope("gru"))?,
@@ -90,23 +109,21 @@ impl Encoder {
     }
 
     fn embed<V: Activations>(&self, tokens: &Tokens<V>, surprises: Option<&Surprises<V>>) -> Result<V> {
-        let part = |part: &Part, value, index| part.forward(value, &tokens.present.channels(index, 1)?);
-        let [state, action, reward] =
-            [part(&self.state, &tokens.state, 0)?, part(&self.action, &tokens.action, 1)?, part(&self.reward, &tokens.reward, 2)?];
-        let x = match (&self.surprise, surprises, &tokens.before) {
-            (Some(parts), Some(surprises), Some(before)) => {
-                let [to_state, to_action, to_reward] = surprised(parts, surprises, before)?;
-                V::beside(&[&state, &action, &reward, &to_state, &to_action, &to_reward, &tokens.noise])?
+        let seen = self.parts.forward([&tokens.state, &tokens.action, &tokens.reward], &tokens.present)?;
+        let surprised = match (&self.surprise, surprises, &tokens.before) {
+            (Some(parts), Some(Surprises { state, action, reward }), Some(before)) => {
+                parts.forward([state, action, reward], &before.told)?
             }
-            _ => V::beside(&[&state, &action, &reward, &tokens.noise])?,
+            _ => [const { None }; 3],
         };
+        // On the stack: an act allocates nothing.
+        let (mut all, mut count) = ([&tokens.noise; 7], 0);
+        for part in seen.iter().chain(&surprised).flatten().chain([&tokens.noise]) {
+            all[count] = part;
+            count += 1;
+        }
+        let x = V::beside(&all[..count])?;
         let x = self.mlp[0].forward(&x)?.activated(Relu)?;
         self.mlp[1].forward(&x)?.activated(Relu)
     }
-}
-
-/// Embeddings of surprises where they are told.
-fn surprised<V: Activations>(parts: &[Part; 3], surprises: &Surprises<V>, before: &Before<V>) -> Result<[V; 3]> {
-    let part = |index: usize, value: &V| parts[index].forward(value, &before.told.channels(index, 1)?);
-    Ok([part(0, &surprises.state)?, part(1, &surprises.action)?, part(2, &surprises.reward)?])
 }

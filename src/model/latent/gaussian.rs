@@ -41,6 +41,23 @@ impl Gaussian {
         Ok(Self { mean: self.mean.narrow(1, start, len)?.contiguous()?, log_var: self.log_var.narrow(1, start, len)?.contiguous()? })
     }
 
+    /// Columns `start..start + len` of the latent.
+    ///
+    /// # Errors
+    /// If there are not as many.
+    pub fn columns(&self, start: usize, len: usize) -> Result<Self> {
+        let cut = |values: &Tensor| values.narrow(candle_core::D::Minus1, start, len)?.contiguous();
+        Ok(Self { mean: cut(&self.mean)?, log_var: cut(&self.log_var)? })
+    }
+
+    /// The same shape, mean 0 and variance 1.
+    ///
+    /// # Errors
+    /// If candle says so.
+    pub fn standard(&self) -> Result<Self> {
+        Ok(Self { mean: self.mean.zeros_like()?, log_var: self.log_var.zeros_like()? })
+    }
+
     /// The same numbers, cut off from the gradient.
     pub fn detach(&self) -> Self {
         Self { mean: self.mean.detach(), log_var: self.log_var.detach() }

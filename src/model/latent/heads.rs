@@ -12,24 +12,33 @@ const DECODER_WIDTH: usize = 64;
 
 /// p(c_t given the distribution of c_{t-1}).
 pub struct Prior {
+    /// Of the columns that move.
     mlp: Mlp,
     dim: usize,
+    /// Leading columns that do not.
+    stays: usize,
 }
 
 impl Prior {
-    pub(super) fn new(dim: usize, params: &Params) -> Result<Self> {
-        Ok(Self { mlp: Mlp::new(2 * dim, PRIOR_WIDTH, 2 * dim, params)?, dim })
+    pub(super) fn new(dim: usize, stays: usize, params: &Params) -> Result<Self> {
+        Ok(Self { mlp: Mlp::new(2 * dim, PRIOR_WIDTH, 2 * (dim - stays), params)?, dim, stays })
     }
 
     /// Gaussians of `(.., dim)` to Gaussians of `(.., dim)`. The network predicts the *change* of the mean, so that an untrained prior
-    /// is a latent that stays as it is.
+    /// is a latent that stays as it is. Columns that stay through an episode keep their distribution; the network sees them.
     ///
     /// # Errors
     /// If the width differs.
     pub fn predict<V: Activations>(&self, before: &Gaussian<V>) -> Result<Gaussian<V>> {
         let out = self.mlp.forward(&V::beside(&[&before.mean, &before.log_var])?)?;
-        let mean = out.channels(0, self.dim)?.plus(&before.mean)?;
-        Ok(Gaussian { mean, log_var: out.channels(self.dim, self.dim)?.clamped(LOG_VAR.0, LOG_VAR.1)? })
+        let (stays, moves) = (self.stays, self.dim - self.stays);
+        let log_var = out.channels(moves, moves)?.clamped(LOG_VAR.0, LOG_VAR.1)?;
+        if stays == 0 {
+            return Ok(Gaussian { mean: out.channels(0, moves)?.plus(&before.mean)?, log_var });
+        }
+        let mean = out.channels(0, moves)?.plus(&before.mean.channels(stays, moves)?)?;
+        let behind = |before: &V, moved: &V| V::beside(&[&before.channels(0, stays)?, moved]);
+        Ok(Gaussian { mean: behind(&before.mean, &mean)?, log_var: behind(&before.log_var, &log_var)? })
     }
 }
 

@@ -35,6 +35,8 @@ pub struct LatentModel {
     pub prior: Option<Prior>,
     /// p(s_{t+1}, r_t given s_t, a_t, c_t).
     pub decoder: Decoder,
+    /// Leading columns that stay through an episode.
+    stays: usize,
 }
 
 impl LatentModel {
@@ -48,10 +50,11 @@ impl LatentModel {
             baseline: baseline.transpose()?,
             encoder: Encoder::new(config, layout, &params.scope("encoder"))?,
             prior: match config.future {
-                Future::Prior => Some(Prior::new(config.dim, &params.scope("prior"))?),
+                Future::Prior => Some(Prior::new(config.dim, config.stays, &params.scope("prior"))?),
                 Future::Held => None,
             },
             decoder: Decoder::new(config.dim, layout, config.baseline.is_some(), &params.scope("decoder"))?,
+            stays: config.stays,
         })
     }
 

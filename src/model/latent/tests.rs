@@ -6,7 +6,7 @@ use super::{
 };
 use crate::model::{
     golden::Golden,
-    method::{Future, GruLatent, Looks},
+    method::{GruLatent, Looks},
     nn::{Buffer, Precision},
     noise::Philox,
     trajectory::Token,
@@ -17,8 +17,7 @@ const LAYOUT: Layout = Layout { state_dim: 3, action_dim: 2 };
 const LEN: usize = 5;
 
 fn model() -> LatentModel {
-    let (config, fresh) =
-        (GruLatent { dim: 6, hidden: 24, looks: Looks::Block(4), future: Future::Prior, baseline: None }, Params::fresh(4));
+    let (config, fresh) = (GruLatent::plain(6, 24, Looks::Block(4)), Params::fresh(4));
     LatentModel::new(&config, LAYOUT, &fresh).unwrap();
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
     LatentModel::new(&config, LAYOUT, &Params::loaded_as(tensors, Precision::F32)).unwrap()
@@ -72,7 +71,7 @@ fn a_row_does_not_depend_on_its_batch() {
 }
 
 fn golden_latent(dim: usize, hidden: usize) -> GruLatent {
-    GruLatent { dim, hidden, looks: Looks::Block(LEN), future: Future::Prior, baseline: None }
+    GruLatent::plain(dim, hidden, Looks::Block(LEN))
 }
 
 /// Posteriors, the prior after the last of them, and what the decoder makes of their means: the results of the golden case, by name.
@@ -116,7 +115,7 @@ fn elbo_against_pytorch() {
     Golden::of("elbo").check_training(|given, params| {
         let [valid, history_shown, successor_shown, eps] =
             ["valid", "history_shown", "successor_shown", "eps"].map(|name| given[name].clone());
-        let batch = ElboBatch { tokens: tokens_of(|name| given[name].clone()), valid, history_shown, successor_shown, eps };
+        let batch = ElboBatch { tokens: tokens_of(|name| given[name].clone()), valid, history_shown, successor_shown, eps, believed: None };
         let terms = LatentModel::new(&golden_latent(2, 7), LAYOUT, params)?.elbo(&batch, &options)?;
         let named = [("loss", terms.loss), ("state_error", terms.state_error), ("reward_error", terms.reward_error), ("kl", terms.kl)];
         Ok(named.map(|(name, term)| (name.into(), term)).into())

@@ -114,6 +114,8 @@ pub struct BlockShape {
     pub looks: Looks,
     /// Width of the latent.
     pub latent_dim: usize,
+    /// Whether columns of it stay, so that one belief has to explain a block.
+    pub stays: bool,
     /// Probability that the posterior sees the successor's action.
     pub show_action: f32,
     /// Probability that it sees the successor's reward, given that it sees the action.
@@ -157,13 +159,25 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
         }
     }
     let eps = (0..shape.batch * steps * shape.latent_dim).map(|_| rng.normal()).collect();
+    let believed = shape.stays.then(|| believed(&valid, steps, rng));
     Ok(ElboBatch {
+        believed: believed.map(|chosen| Tensor::from_vec(chosen, (shape.batch, 1, steps), &Device::Cpu)).transpose()?,
         tokens: rows.tokens(shape.batch, shape.len)?,
         valid: Tensor::from_vec(valid, (shape.batch, steps), &Device::Cpu)?,
         history_shown: Tensor::from_vec(history, (shape.batch, shape.len, 3), &Device::Cpu)?,
         successor_shown: Tensor::from_vec(successor, (shape.batch, steps, 3), &Device::Cpu)?,
         eps: Tensor::from_vec::<_, f32>(eps, (shape.batch, steps, shape.latent_dim), &Device::Cpu)?,
     })
+}
+
+/// Of each row 1 at one of its valid steps but the last, each equally likely.
+fn believed(valid: &[f32], steps: usize, rng: &mut Philox) -> Vec<f32> {
+    let mut chosen = vec![0.0; valid.len()];
+    for (row, valid) in chosen.chunks_exact_mut(steps).zip(valid.chunks_exact(steps)) {
+        let first = valid.iter().position(|valid| *valid == 1.0).unwrap_or(0);
+        row[first + rng.below((steps - 1).saturating_sub(first).max(1))] = 1.0;
+    }
+    chosen
 }
 
 /// What a batch of windows to denoise looks like.

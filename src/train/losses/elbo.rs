@@ -44,6 +44,7 @@ impl<'a> ElboLoss<'a> {
             len: latent.block_len() + 1 + config.length,
             looks: latent.looks,
             latent_dim: latent.dim,
+            stays: latent.stays > 0,
             show_action: config.show_action,
             show_reward: config.show_reward,
             hide: task.recipe.hide,

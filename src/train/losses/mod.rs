@@ -9,7 +9,7 @@ use super::{
     Task,
     learner::{Learner, Scalars},
     parallel::side_by_side,
-    recipe::stages::Stage,
+    recipe::{losses::Loss, stages::Stage},
 };
 use crate::model::{Networks, noise::Philox};
 use anyhow::Result;
@@ -110,6 +110,21 @@ impl<'a> Objective<'a> {
             scalars.push(("held_out_context_free", context_free.held_out(networks)?));
         }
         Ok(scalars)
+    }
+
+    /// What of these losses on held-out episodes the stage minimizes, in one number; none where it has no held-out loss.
+    pub fn score(&self, held_out: &Scalars) -> Option<f64> {
+        let of = |loss: &Loss| match loss {
+            Loss::Denoise => "held_out_loss",
+            Loss::Elbo => "held_out_elbo",
+            Loss::ContextFree => "held_out_context_free",
+        };
+        let weighted = |(loss, weight): (&Loss, &f64)| {
+            let found = held_out.iter().find(|(name, _)| *name == of(loss))?;
+            Some(weight * found.1)
+        };
+        let parts: Vec<f64> = self.stage.minimizes.iter().filter_map(weighted).collect();
+        (!parts.is_empty()).then(|| parts.iter().sum())
     }
 }
 

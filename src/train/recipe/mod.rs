@@ -17,7 +17,7 @@ use crate::model::{
 use error::require;
 use losses::{Losses, TrainingLevels};
 use serde::{Deserialize, Serialize};
-use stages::{Gate, Stage};
+use stages::{Gate, Keeps, Stage};
 use std::{
     collections::BTreeSet,
     path::{Path, PathBuf},
@@ -147,6 +147,16 @@ impl Recipe {
     fn refines(&self) -> bool {
         let loss = &self.losses.denoise;
         self.model.can_refine() && loss.routing == LatentRouting::Matched && loss.levels == TrainingLevels::Schedule
+    }
+
+    /// The key that asks for a probe for the recorded context, if one does.
+    pub fn probe_key(&self) -> Option<String> {
+        let key = |stage: &Stage| match (&stage.gate, stage.keeps) {
+            (Some(_), _) => Some(format!("stages.{}.gate", stage.name)),
+            (None, Keeps::LeastProbe(_)) => Some(format!("stages.{}.keeps", stage.name)),
+            (None, Keeps::Last | Keeps::LeastHeldOut(_)) => None,
+        };
+        self.stages.iter().find_map(key)
     }
 
     /// The gate of this run, wherever it stands.

@@ -77,8 +77,39 @@ pub struct Stage {
     pub weight_decay: f64,
     /// Largest decay of the average of the weights, which is what a checkpoint holds; absent: no average.
     pub ema_decay_max: Option<f64>,
+    /// Which of its weights the stage hands on to the next.
+    #[serde(default, skip_serializing_if = "Keeps::is_last")]
+    pub keeps: Keeps,
     /// What must be reached before the next stage.
     pub gate: Option<Gate>,
+}
+
+/// Which weights a stage ends with. What was found can be lost again: the ELBO of a context that stays pays less and less for it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Keeps {
+    /// Those of its last step.
+    #[default]
+    Last,
+    /// Measured every so many steps: the ones with the least loss on held-out episodes.
+    LeastHeldOut(usize),
+    /// Measured every so many steps: the ones from which a linear probe finds `infos/context` best, on held-out episodes and without the
+    /// successor.
+    LeastProbe(usize),
+}
+
+impl Keeps {
+    fn is_last(&self) -> bool {
+        *self == Self::Last
+    }
+
+    /// Whether weights are measured after `step` of `steps`.
+    pub fn is_due(self, step: usize, steps: usize) -> bool {
+        match self {
+            Self::Last => false,
+            Self::LeastHeldOut(every) | Self::LeastProbe(every) => step.is_multiple_of(every) || step == steps,
+        }
+    }
 }
 
 impl Stage {
@@ -120,6 +151,14 @@ impl Stage {
         require(rate.peak.is_finite() && rate.peak > 0.0, key("learning_rate.peak"), "must be positive and finite")?;
         require(rate.end >= 0.0 && rate.end <= rate.peak, key("learning_rate.end"), "must lie between 0 and the peak")?;
         require(self.ema_decay_max.is_none_or(|decay| (0.0..1.0).contains(&decay)), key("ema_decay_max"), "must lie in 0..1")?;
+        match self.keeps {
+            Keeps::Last => {}
+            Keeps::LeastHeldOut(every) => between(key("keeps.least_held_out"), every, 1..=usize::MAX)?,
+            Keeps::LeastProbe(every) => {
+                between(key("keeps.least_probe"), every, 1..=usize::MAX)?;
+                require(self.identifies(), key("keeps.least_probe"), "asks for a stage that minimizes the elbo alone")?;
+            }
+        }
         let Some(gate) = &self.gate else { return Ok(()) };
         require(self.identifies(), key("gate"), "asks for a stage that minimizes the elbo alone")?;
         gate.check(&self.name)
@@ -164,5 +203,10 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
     let learns = |group: Group| recipe.stages.iter().any(|stage| stage.trains.get(&group).is_some_and(|factor| *factor > 0.0));
     require(learns(Group::Denoiser), "stages", "train no denoiser, and a checkpoint of random weights would be shipped")?;
     require(recipe.model.latent.gru().is_none() || learns(Group::Latent), "stages", "train no latent, but model.latent asks for it")?;
+    require(
+        last.keeps == Keeps::Last,
+        key("keeps"),
+        "must be last in the last stage: `--keep-best` ships its best weights beside the last",
+    )?;
     require(last.gate.is_none(), key("gate"), "opens the way to another stage, and this is the last")
 }

@@ -1,7 +1,7 @@
 //! What becomes of the server when something around it is broken: the reader of its log, the disk that the log is on, a thread, a model.
 
 use super::*;
-use ada_diffuser::model::method::{Future, GruLatent, LatentSource, Looks};
+use ada_diffuser::model::method::{GruLatent, LatentSource, Looks};
 use std::{fs::File, net::TcpListener, time::Instant};
 
 /// The process on an address that is told to it, for its log will not tell; its stderr is `log`.
@@ -103,10 +103,7 @@ async fn broken_models_cost_themselves() {
     type Change = fn(&mut ModelConfig);
     let absurd: [(&str, Change); 6] = [
         ("levels", |config| config.method.plan.level_max = 1_000_000_000_000),
-        ("block", |config| {
-            config.method.latent =
-                LatentSource::Gru(GruLatent { dim: 6, hidden: 32, looks: Looks::Block(1 << 62), future: Future::Prior, baseline: None })
-        }),
+        ("block", |config| config.method.latent = LatentSource::Gru(GruLatent::plain(6, 32, Looks::Block(1 << 62)))),
         ("horizon", |config| config.method.plan.horizon = usize::MAX / 2),
         ("sub-steps", |config| config.defaults.sampler.sub_steps = (1 << 61) + 1),
         ("clip", |config| config.method.plan.clip = f32::INFINITY),

@@ -9,7 +9,7 @@ fn running() -> Agent {
 
 fn running_beside(baseline: Option<Baseline>, future: Future) -> Agent {
     let mut config = agent(true, 1, unet()).config.clone();
-    config.method.latent = LatentSource::Gru(GruLatent { dim: 5, hidden: 16, looks: Looks::Running, future, baseline });
+    config.method.latent = LatentSource::Gru(GruLatent { future, baseline, ..GruLatent::plain(5, 16, Looks::Running) });
     config.trained.refined = false;
     config.defaults.sampler.kappa = 0.0;
     config.check().unwrap();
@@ -83,8 +83,7 @@ fn check_a_reset_keeps_the_memory(agent: &Agent) {
 #[test]
 fn what_a_method_does_not_have_is_refused() {
     let mut config = running().config.clone();
-    config.method.latent =
-        LatentSource::Gru(GruLatent { dim: 5, hidden: 16, looks: Looks::Running, future: Future::Prior, baseline: None });
+    config.method.latent = LatentSource::Gru(GruLatent::plain(5, 16, Looks::Running));
     (config.trained.refined, config.trained.action_horizons) = (true, vec![1, 2]);
     assert_eq!(config.check().unwrap_err().field, "method.latent.looks");
     let uniform = Schedule::Uniform { steps: 5 };
