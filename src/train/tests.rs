@@ -3,6 +3,8 @@
 use super::{
     Options, Outcome, Task,
     dataset::{Split, UnitsFrom, hdf5, room::Room, units::ActionsConfig},
+    learner::Learner,
+    losses::Objective,
     recipe::Recipe,
     resume, run,
 };
@@ -73,6 +75,29 @@ fn a_stopped_run_goes_on_with_the_same_bits() {
         text.lines().map(key).collect()
     };
     assert_eq!(steps(whole.path()), steps(parts.path()));
+}
+
+/// Steps that are too large spoil what was found; the next stage begins with the weights that were best on held-out episodes, also after a
+/// stop in between.
+#[test]
+fn a_stage_hands_on_its_best_weights() {
+    let keys = ["stages.identify.keeps={least_held_out = 1}", "stages.identify.steps=6", "stages.identify.learning_rate={peak = 0.5, end = 0.5, warm_up = 6, decay = \"cosine\"}"];
+    let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    train(&keys, whole.path(), Some(6)).unwrap();
+    let log = fs::read_to_string(whole.path().join("training/log.jsonl")).unwrap();
+    let lines = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+    let scores: Vec<f64> = lines.filter_map(|line| line["keeps_least"].as_f64()).collect();
+    let least = scores.iter().copied().fold(f64::INFINITY, f64::min);
+    assert!(scores.len() == 6 && *scores.last().unwrap() > least, "{scores:?}");
+    let task = Task::new(recipe_with(&keys).unwrap(), &Room::default()).unwrap();
+    let state = resume::Store::new(&whole.path().join("training"), &task.recipe, &task.dataset_digest).load().unwrap().unwrap();
+    let handed_on = Learner::resumed(&task, state).unwrap();
+    let held_out = Objective::new(&task, 0).held_out(&handed_on.networks).unwrap();
+    assert_eq!(Objective::new(&task, 0).score(&held_out), Some(least));
+    train(&keys, whole.path(), None).unwrap();
+    train(&keys, parts.path(), Some(5)).unwrap();
+    train(&keys, parts.path(), None).unwrap();
+    assert!(shipped(whole.path()) == shipped(parts.path()), "a stop loses what was kept");
 }
 
 /// Another seed makes other weights: the test above does not pass by a constant.
@@ -272,6 +297,9 @@ fn wrong_recipes_name_the_key() {
         ("sampler.kappa=-1.0", "sampler.kappa"),
         ("name=\"Half Cheetah\"", "`name`"),
         ("stages.denoise.minimizes.elbo=inf", "stages.denoise.minimizes.elbo"),
+        ("stages.denoise.keeps={least_held_out = 5}", "stages.denoise.keeps"),
+        ("stages.identify.keeps={least_probe = 0}", "stages.identify.keeps.least_probe"),
+        ("model.latent.stays=2", "model.latent.stays"),
         ("stages.identify.weight_decay=-1.0", "stages.identify.weight_decay"),
         ("model.plan.backbone={kind = \"dit\", width = 9, depth = 1, heads = 3}", "model.plan.backbone.width"),
         ("losses.denoise.ready_fraction=1.5", "losses.denoise.ready_fraction"),
