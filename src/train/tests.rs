@@ -81,7 +81,11 @@ fn a_stopped_run_goes_on_with_the_same_bits() {
 /// stop in between.
 #[test]
 fn a_stage_hands_on_its_best_weights() {
-    let keys = ["stages.identify.keeps={least_held_out = 1}", "stages.identify.steps=6", "stages.identify.learning_rate={peak = 0.5, end = 0.5, warm_up = 6, decay = \"cosine\"}"];
+    let keys = [
+        "stages.identify.keeps={least_held_out = 1}",
+        "stages.identify.steps=6",
+        "stages.identify.learning_rate={peak = 0.5, end = 0.5, warm_up = 6, decay = \"cosine\"}",
+    ];
     let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     train(&keys, whole.path(), Some(6)).unwrap();
     let log = fs::read_to_string(whole.path().join("training/log.jsonl")).unwrap();

@@ -5,8 +5,7 @@ use ada_diffuser::model::{
     Networks,
     agent::{Act, Agent, Episode, Observation, Start},
     config::{ModelConfig, Restart},
-    method::Backbone,
-    method::{GruLatent, Looks},
+    method::{Actions, Backbone, Baseline, GruLatent, Looks},
     nn::Params,
     options::{LatentMode, SamplerOptions},
     trajectory::Layout,
@@ -44,10 +43,14 @@ fn asked_during(work: impl FnOnce()) -> usize {
     ASKED.get() - before
 }
 
-fn agent(backbone: Backbone, obs_horizon: usize) -> Agent {
-    let latent = GruLatent::plain(5, 16, Looks::Block(4));
+fn agent(latent: GruLatent, backbone: Backbone, obs_horizon: usize) -> Agent {
+    let running = latent.looks == Looks::Running;
     let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, Some(latent), backbone);
     config.method.plan.obs_horizon = obs_horizon;
+    if running {
+        // Its memory holds real steps alone, so chunks that are refined have one action.
+        config.trained.action_horizons = vec![1];
+    }
     // Every warm act is noised again a little.
     config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e7, latent_jump: f32::INFINITY };
     let fresh = Params::fresh(1);
@@ -71,13 +74,20 @@ fn go_down(agent: &Agent, acts: &mut Vec<Act>) {
 
 #[test]
 fn a_tick_allocates_nothing() {
-    for (denoiser, obs_horizon) in [(Backbone::Unet { widths: vec![8, 16, 16] }, 1), (Backbone::Dit { width: 16, depth: 2, heads: 2 }, 3)] {
-        let agent = agent(denoiser, obs_horizon);
+    let (unet, dit) = (Backbone::Unet { widths: vec![8, 16, 16] }, Backbone::Dit { width: 16, depth: 2, heads: 2 });
+    let block = GruLatent::plain(5, 16, Looks::Block(4));
+    let surprised = GruLatent { baseline: Some(Baseline { width: 7 }), stays: 2, ..block.clone() };
+    let running = GruLatent { looks: Looks::Running, actions: Actions::Unseen, ..surprised.clone() };
+    for (latent, denoiser, obs_horizon) in
+        [(block.clone(), unet.clone(), 1), (block, dit, 3), (surprised, unet.clone(), 1), (running, unet, 1)]
+    {
+        let chunks = if latent.looks == Looks::Running { 1 } else { 3 };
+        let agent = agent(latent, denoiser, obs_horizon);
         let options = |i: u64| SamplerOptions {
             eta: 1.0,
             kappa: [0.0, 0.01, f32::INFINITY][i as usize % 3],
             latent: if i.is_multiple_of(2) { LatentMode::Mean } else { LatentMode::Sample },
-            action_horizon: 1 + i as usize % 3,
+            action_horizon: 1 + i as usize % chunks,
             streaming: !i.is_multiple_of(4),
             ..SamplerOptions::default()
         };
