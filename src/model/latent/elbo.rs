@@ -1,8 +1,9 @@
 //! Evidence lower bound over a block (equation of section 4.2; appendix A.4).
 
 use super::{Baseline, Gaussian, LatentModel, Surprises, Tokens};
-use crate::model::trajectory::Seen;
+use crate::model::trajectory::{Layout, Seen};
 use candle_core::{Device, Result, Tensor};
+use serde::{Deserialize, Serialize};
 
 /// One batch of blocks.
 pub struct ElboBatch {
@@ -37,6 +38,20 @@ pub struct ElboOptions {
     pub action_weight: f64,
     /// Nats of a step's KL that cost nothing (Kingma et al. 2016).
     pub free_bits: f64,
+    /// Predictions of later steps.
+    pub ahead: Ahead,
+}
+
+/// Latent overshooting (Hafner et al. 2019): the means of the prior chain from each belief explain the steps after its own, as they stand for
+/// these in a window. A posterior that waits for its successor can pay for its bits by the noise of that one step; what holds on is all that can
+/// tell of the next ones.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Ahead {
+    /// How many steps; 0 is off.
+    pub steps: usize,
+    /// Of their mean error, against that of the belief's own step.
+    pub weight: f64,
 }
 
 /// Scalars of one evaluation.
@@ -49,6 +64,8 @@ pub struct ElboTerms {
     pub reward_error: Tensor,
     /// The same of actions, beside a baseline.
     pub action_error: Option<Tensor>,
+    /// Weighted errors of the steps ahead, their mean; half sums beside a baseline.
+    pub ahead: Option<Tensor>,
     /// KL(q || p), summed over latent dimensions, mean over positions.
     pub kl: Tensor,
 }
@@ -110,26 +127,62 @@ impl LatentModel {
         let (latent, stays) = self.drawn(&q, batch, from)?;
         let aims = Aims::new(&batch.tokens, surprises.as_ref(), from, options)?;
         let now = batch.tokens.narrow(from, steps)?;
-        let told = self.decoder.predict(&now.state, &now.action, &latent)?;
+        let errors = self.errors(&now, &latent, &aims, &valid)?;
+        let kl = self.block_kl(&q, stays.as_ref(), &valid, options.free_bits)?;
+        let mut loss = (self.weighted(&errors, options)? + kl.affine(options.kl_weight, 0.0)?)?;
+        let ahead = self.ahead(&q, &now, &aims, &valid, options)?;
+        if let Some(error) = &ahead {
+            loss = (loss + error.affine(options.ahead.weight, 0.0)?)?;
+        }
+        let Errors { state: state_error, reward: reward_error, action: action_error } = errors;
+        Ok(ElboTerms { loss, state_error, reward_error, action_error, ahead, kl })
+    }
+
+    /// How far what latents say of steps is from what they have to explain: means over valid steps and columns.
+    fn errors(&self, now: &Tokens, latent: &Tensor, aims: &Aims, valid: &Tensor) -> Result<Errors> {
+        let told = self.decoder.predict(&now.state, &now.action, latent)?;
         let count = valid.sum_all()?;
         let error = |told: Tensor, aim: &Tensor| -> Result<Tensor> {
             let squares = (told - aim)?.sqr()?.broadcast_mul(&valid.unsqueeze(2)?)?;
             squares.sum((0, 1))?.broadcast_div(&count)?.mean_all()
         };
-        // Of a sum of squares over the columns half, or their mean.
+        Ok(Errors {
+            state: error(told.state, &aims.state)?,
+            reward: error(told.reward, &aims.reward)?,
+            action: told.action.zip(aims.action.as_ref()).map(|(told, aim)| error(told, aim)).transpose()?,
+        })
+    }
+
+    /// The sum of the parts, each by its weight: beside a baseline of half sums of squares over the columns, else of means.
+    fn weighted(&self, errors: &Errors, options: &ElboOptions) -> Result<Tensor> {
+        let Layout { state_dim, action_dim } = self.decoder.layout();
         let half = |width: usize| if self.baseline.is_some() { width as f64 / 2.0 } else { 1.0 };
-        let state_error = error(told.state, &aims.state)?;
-        let reward_error = error(told.reward, &aims.reward)?;
-        let action_error = told.action.zip(aims.action).map(|(told, aim)| error(told, &aim)).transpose()?;
-        let kl = self.block_kl(&q, stays.as_ref(), &valid, options.free_bits)?;
-        let weighted = |error: &Tensor, weight: f64| if weight == 1.0 { Ok(error.clone()) } else { error.affine(weight, 0.0) };
-        let mut rec = (weighted(&state_error, options.state_weight * half(now.state.dim(2)?))?
-            + reward_error.affine(options.reward_weight * half(1), 0.0)?)?;
-        if let Some(error) = &action_error {
-            rec = (rec + error.affine(options.action_weight * half(now.action.dim(2)?), 0.0)?)?;
+        let times = |error: &Tensor, weight: f64| if weight == 1.0 { Ok(error.clone()) } else { error.affine(weight, 0.0) };
+        let state = times(&errors.state, options.state_weight * half(state_dim))?;
+        let sum = (state + errors.reward.affine(options.reward_weight * half(1), 0.0)?)?;
+        match &errors.action {
+            Some(error) => sum + error.affine(options.action_weight * half(action_dim), 0.0)?,
+            None => Ok(sum),
         }
-        let loss = (rec + kl.affine(options.kl_weight, 0.0)?)?;
-        Ok(ElboTerms { loss, state_error, reward_error, action_error, kl })
+    }
+
+    /// Mean weighted error of the steps after each belief's own; see [`Ahead`]. As many of them as a block has room for.
+    fn ahead(&self, q: &Gaussian, now: &Tokens, aims: &Aims, valid: &Tensor, options: &ElboOptions) -> Result<Option<Tensor>> {
+        let all = valid.dim(1)?;
+        let (mut sum, mut steps) = (None, 0);
+        self.roll_out(q.clone(), options.ahead.steps.min(all - 1), |next| {
+            steps += 1;
+            let rest = all - steps;
+            let latent = next.mean.narrow(1, 0, rest)?.contiguous()?;
+            let errors = self.errors(&now.narrow(steps, rest)?, &latent, &aims.narrow(steps, rest)?, &valid.narrow(1, 0, rest)?)?;
+            let error = self.weighted(&errors, options)?;
+            sum = Some(match sum.take() {
+                None => error,
+                Some(sum) => (sum + error)?,
+            });
+            Ok(())
+        })?;
+        sum.map(|sum: Tensor| sum / steps as f64).transpose()
     }
 
     /// The latents that explain the steps of a block, and the first step that has one: c_t of a model with a prior waits for what is shown of
@@ -211,6 +264,18 @@ impl Aims {
         };
         Ok(Self { state: cut(state, from + 1)?, reward: cut(reward, from)?, action: Some(cut(action, from)?) })
     }
+
+    fn narrow(&self, start: usize, len: usize) -> Result<Self> {
+        let cut = |tensor: &Tensor| tensor.narrow(1, start, len)?.contiguous();
+        Ok(Self { state: cut(&self.state)?, reward: cut(&self.reward)?, action: self.action.as_ref().map(cut).transpose()? })
+    }
+}
+
+/// See [`LatentModel::errors`].
+struct Errors {
+    state: Tensor,
+    reward: Tensor,
+    action: Option<Tensor>,
 }
 
 /// See [`LatentModel::explained`].

@@ -25,6 +25,7 @@ fn options() -> ElboOptions {
         reward_weight: 0.7,
         action_weight: 0.6,
         free_bits: 0.0,
+        ahead: Ahead::default(),
     }
 }
 
@@ -86,7 +87,7 @@ fn staying(stays: usize, baseline: Option<Baseline>, future: Future, params: &Pa
 fn gradient_is_the_central_difference() {
     [(Future::Prior, 2), (Future::Held, 2)].into_iter().for_each(|(future, seed)| {
         let params = Params::fresh(seed);
-        check_gradient(&params, &model_of(future, &params), &batch());
+        check_gradient(&params, &model_of(future, &params), &batch(), &options());
     });
 }
 
@@ -98,7 +99,7 @@ fn gradient_of_what_stays() {
         [(1, None, Future::Prior), (1, Some(Baseline { width: 5 }), Future::Prior), (1, None, Future::Held), (DIM, None, Future::Held)]
     {
         let params = Params::fresh(6);
-        check_gradient(&params, &staying(stays, baseline, future, &params), &batch_that_stays());
+        check_gradient(&params, &staying(stays, baseline, future, &params), &batch_that_stays(), &options());
     }
 }
 
@@ -108,13 +109,23 @@ fn gradient_beside_a_baseline() {
     [Future::Prior, Future::Held].into_iter().for_each(|future| {
         // Another seed, whose numbers lie away from the kinks as well.
         let params = Params::fresh(5);
-        check_gradient(&params, &beside(Some(Baseline { width: 5 }), future, &params), &batch());
+        check_gradient(&params, &beside(Some(Baseline { width: 5 }), future, &params), &batch(), &options());
     });
 }
 
-fn check_gradient(params: &Params, model: &LatentModel, batch: &ElboBatch) {
-    let loss = || f64::from(model.elbo(batch, &options()).unwrap().loss.to_scalar::<f32>().unwrap());
-    let grads = model.elbo(batch, &options()).unwrap().loss.backward().unwrap();
+/// The same of steps ahead, of which a block has fewer than were asked for.
+#[test]
+fn gradient_of_steps_ahead() {
+    let options = ElboOptions { ahead: Ahead { steps: 9, weight: 0.5 }, ..options() };
+    for future in [Future::Prior, Future::Held] {
+        let params = Params::fresh(6);
+        check_gradient(&params, &model_of(future, &params), &batch(), &options);
+    }
+}
+
+fn check_gradient(params: &Params, model: &LatentModel, batch: &ElboBatch, options: &ElboOptions) {
+    let loss = || f64::from(model.elbo(batch, options).unwrap().loss.to_scalar::<f32>().unwrap());
+    let grads = model.elbo(batch, options).unwrap().loss.backward().unwrap();
     for (name, var) in params.vars().into_iter().filter(|(name, _)| !name.starts_with("baseline.")) {
         let mut stream = Philox::named(9, &name);
         let direction: Vec<f32> = (0..var.elem_count()).map(|_| stream.normal()).collect();
@@ -333,4 +344,41 @@ fn unseen_actions() {
         };
         assert_ne!(infer(&clean), infer(&moved));
     }
+}
+
+/// Steps ahead, row by row and step by step: the prior's means from each posterior, one and two steps on, against what happened there.
+#[test]
+fn steps_ahead_by_hand() {
+    let model = model(&Params::fresh(2));
+    let batch = batch();
+    let options = ElboOptions { ahead: Ahead { steps: 2, weight: 0.5 }, ..options() };
+    let q = model.posteriors(&batch.tokens, &batch.history_shown, &batch.successor_shown).unwrap();
+    let prior = model.prior.as_ref().unwrap();
+    let state = batch.tokens.state.to_vec3::<f32>().unwrap();
+    let reward = batch.tokens.reward.to_vec3::<f32>().unwrap();
+    let (mut expected, mut next) = (0.0, q);
+    for d in 1..=2 {
+        next = prior.predict(&next).unwrap();
+        let (mut sum, mut count) = ([0.0, 0.0], 0.0);
+        for row in 0..BATCH {
+            for t in (0..LEN - 1 - d).filter(|t| row != 1 || *t >= 2) {
+                let at = |tensor: &Tensor, t: usize| tensor.narrow(0, row, 1).unwrap().narrow(1, t, 1).unwrap().contiguous().unwrap();
+                let told =
+                    model.decoder.predict(&at(&batch.tokens.state, t + d), &at(&batch.tokens.action, t + d), &at(&next.mean, t)).unwrap();
+                let told_state = told.state.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+                for column in 0..3 {
+                    let change = (state[row][t + d + 1][column] - state[row][t + d][column]) / options.state_change_std[column];
+                    sum[0] += (told_state[column] - change).powi(2) / 3.0;
+                }
+                sum[1] += (told.reward.flatten_all().unwrap().to_vec1::<f32>().unwrap()[0] - reward[row][t + d][0]).powi(2);
+                count += 1.0;
+            }
+        }
+        expected += (sum[0] + 0.7 * sum[1]) / count / 2.0;
+    }
+    let terms = model.elbo(&batch, &options).unwrap();
+    let number = |tensor: &Tensor| tensor.to_scalar::<f32>().unwrap();
+    assert!((number(terms.ahead.as_ref().unwrap()) - expected).abs() < 1e-4 * expected, "{expected}");
+    let without = model.elbo(&batch, &ElboOptions { ahead: Ahead::default(), ..options }).unwrap();
+    assert!((number(&terms.loss) - number(&without.loss) - 0.5 * expected).abs() < 1e-4 * expected && without.ahead.is_none());
 }

@@ -48,6 +48,7 @@ pub struct Decoder {
     state: Mlp,
     reward: Mlp,
     action: Option<Mlp>,
+    layout: Layout,
 }
 
 /// What a latent says of a step.
@@ -68,7 +69,13 @@ impl Decoder {
             state: Mlp::new(d_in, DECODER_WIDTH, layout.state_dim, &params.scope("state"))?,
             reward: Mlp::new(d_in, DECODER_WIDTH, 1, &params.scope("reward"))?,
             action: acts.then(action).transpose()?,
+            layout,
         })
+    }
+
+    /// Widths of what is told.
+    pub fn layout(&self) -> Layout {
+        self.layout
     }
 
     /// From `(.., state_dim)`, `(.., action_dim)`, `(.., dim)`; of the action only what needs to be known is looked at.

@@ -1,7 +1,7 @@
 //! The latent networks on both kinds of values, and against PyTorch's.
 
 use super::{
-    elbo::{ElboBatch, ElboOptions},
+    elbo::{Ahead, ElboBatch, ElboOptions},
     *,
 };
 use crate::model::{
@@ -111,6 +111,7 @@ fn elbo_against_pytorch() {
         reward_weight: 0.7,
         action_weight: 0.6,
         free_bits: 0.0,
+        ahead: Ahead::default(),
     };
     Golden::of("elbo").check_training(|given, params| {
         let [valid, history_shown, successor_shown, eps] =

@@ -75,6 +75,7 @@ impl<'a> ElboLoss<'a> {
             reward_weight: self.config.reward_weight,
             action_weight: self.config.action_weight.unwrap_or(0.0),
             free_bits: self.config.free_bits,
+            ahead: self.config.ahead,
         };
         let latent = networks.latent.as_ref().context("the ELBO needs a latent model: is a bug")?;
         let terms = latent.elbo(batch, &options)?;
@@ -86,6 +87,7 @@ impl<'a> ElboLoss<'a> {
             mean("kl", &terms.kl)?,
         ];
         means.extend(terms.action_error.as_ref().map(|error| mean("action_error", error)).transpose()?);
+        means.extend(terms.ahead.as_ref().map(|error| mean("ahead", error)).transpose()?);
         Ok((terms.loss, means))
     }
 
@@ -107,6 +109,7 @@ impl<'a> ElboLoss<'a> {
             "state_error" => "held_out_state_error",
             "reward_error" => "held_out_reward_error",
             "action_error" => "held_out_action_error",
+            "ahead" => "held_out_ahead",
             _ => "held_out_kl",
         };
         Ok(means.into_iter().map(|mean| (held_out(mean.name), mean.sum)).collect())

@@ -6,6 +6,7 @@ use super::{
 };
 use crate::model::{
     diffusion::refine::LatentRouting,
+    latent::elbo::Ahead,
     method::{Future, Schedule},
 };
 use serde::{Deserialize, Serialize};
@@ -78,6 +79,9 @@ pub struct ElboConfig {
     /// Nats of a step's KL that cost nothing.
     #[serde(default)]
     pub free_bits: f64,
+    /// Predictions of later steps.
+    #[serde(default, skip_serializing_if = "is_off")]
+    pub ahead: Ahead,
     /// Probability that the posterior sees the successor's action.
     pub show_action: f32,
     /// Probability that it sees the successor's reward, given the action.
@@ -95,8 +99,14 @@ impl ElboConfig {
         between("losses.elbo.state_weight", self.state_weight, WEIGHTS)?;
         between("losses.elbo.reward_weight", self.reward_weight, WEIGHTS)?;
         between("losses.elbo.action_weight", self.action_weight.unwrap_or(0.0), WEIGHTS)?;
+        between("losses.elbo.ahead.weight", self.ahead.weight, WEIGHTS)?;
+        between("losses.elbo.ahead.steps", self.ahead.steps, 0..=self.length - 1)?;
         between("losses.elbo.free_bits", self.free_bits, WEIGHTS)
     }
+}
+
+fn is_off(ahead: &Ahead) -> bool {
+    *ahead == Ahead::default()
 }
 
 fn one() -> f64 {
