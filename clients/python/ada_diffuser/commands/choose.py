@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> None:
         runner = _Runner(arguments, client, {setting: str(variants.index(_restart(setting, facts))) for setting in settings})
         runner.check()
         choice = decide(race(settings, arguments.episodes, runner.play))
-    keys, out = choice.chosen.setting.keys(), arguments.write or Path(f"{arguments.choose}-chosen")
+    keys, out = choice.chosen.setting.overrides(), arguments.write or Path(f"{arguments.choose}-chosen")
     line = defaults_line(arguments.choose, out, keys)
     if arguments.json:
         save_json(_as_json(arguments, inspected["digest"], choice, line), arguments.json)
@@ -141,8 +141,8 @@ def _as_json(arguments: argparse.Namespace, digest: str, choice: Choice, line: s
         "episodes": arguments.episodes,
         "withhold_rewards": arguments.withhold_rewards,
         "rule": " ".join(RULE.split()),
-        "chosen": choice.chosen.setting.keys(),
-        "reference": choice.reference.setting.keys(),
+        "chosen": choice.chosen.setting.overrides(),
+        "reference": choice.reference.setting.overrides(),
         "reason": choice.reason(),
         "command": line,
         "settings": [of(one) for one in choice.tried],

@@ -51,7 +51,8 @@ variants of the checkpoint are written to a temporary folder and served on loopb
 kappa, temperature, latent_jump and cold_distance, with the checkpoint's own values and some on either side; --set takes the place of a
 key's values (renoise_distance and the other sampling options too).
 {choose.RULE}
-A setting that is more than two standard errors below the best cold one after a quarter or half of the episodes is run no further.
+A setting that is more than two standard errors below the best cold one after a quarter of the episodes is run no further (far below), nor
+is one that needs more evaluations than one that qualifies (dearer).
 
   ada-evaluate --env cheetah-vel-e --choose runs/cheetah-vel-e-seed3 --json chosen.json --write shipped/cheetah-vel-e-seed3"""
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,9 +27,9 @@ GRID = {
 RESTART = ("renoise_distance", "cold_distance", "latent_jump")
 #: Fewer evaluations an act than this are no difference.
 EVALUATIONS_ALIKE = 0.1
-#: A setting is dropped before the last round when it is so many standard errors below the best cold one.
+#: A setting is run no further when it is so many standard errors below the best cold one.
 DROPPED_BELOW = 2.0
-#: No verdict on fewer episodes before the last round.
+#: Nothing is dropped after fewer episodes.
 EPISODES_TO_DROP = 8
 
 
@@ -56,7 +56,7 @@ class Setting:
         """In a line of a log."""
         return " ".join(f"{name}={word(value)}" for name, value in self.values().items())
 
-    def keys(self) -> list[str]:
+    def overrides(self) -> list[str]:
         """As `ada-trainer defaults --set` takes them: `sampler.kappa=0.1`."""
         sections = [("sampler", self.options.given()), ("restart", dict(self.restart))]
         return [f"{section}.{name}={word(value)}" for section, values in sections for name, value in values.items()]
@@ -142,7 +142,8 @@ class Gap:
 
     @classmethod
     def between(cls, below: Evaluation, above: Evaluation) -> Gap:
-        differences = above.returns - below.returns
+        """On the episodes that `below` has, which may be fewer."""
+        differences = above.returns[: len(below.episodes)] - below.returns
         return cls(float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(len(differences))))
 
 
@@ -161,29 +162,52 @@ class Tried:
     def episodes(self) -> int:
         return len(self.result.episodes)
 
+    @property
+    def evaluations(self) -> float:
+        """Of an act."""
+        return self.result.evaluations_per_act
+
 
 #: Runs so many episodes more of a setting, the first of them with the offset: `play(setting, offset, episodes)`.
 Play = Callable[[Setting, int, int], Evaluation]
 
 
-def rounds(episodes: int) -> list[int]:
-    """Episodes that were run when each round ends: a quarter, half, all; the early ones only where they can tell anything."""
-    return [*(part for part in (episodes // 4, episodes // 2) if part >= EPISODES_TO_DROP), episodes]
+def screened_on(episodes: int) -> int:
+    """Episodes after which settings without a chance are dropped: a quarter, or all where that could tell nothing."""
+    return episodes // 4 if episodes // 4 >= EPISODES_TO_DROP else episodes
 
 
 def race(settings: Sequence[Setting], episodes: int, play: Play) -> list[Tried]:
-    """Every setting on as many episodes as it takes to see that it has no chance, the others on all; in the order of `settings`."""
+    """Each setting on as many episodes as the rule needs of it, in the order of `settings`.
+
+    The cold ones first: the best of them on all episodes, and those that a quarter does not show to be worse. Then a quarter with
+    each of the others, and all episodes with those that are not clearly worse, the cheapest first, until one qualifies that none of the
+    rest is cheaper than.
+    """
     if episodes < 2:
         raise ValueError("a choice needs at least 2 episodes")
     tried: dict[Setting, Tried] = {}
-    running, done = list(settings), 0
-    for end in rounds(episodes):
-        for setting in running:
-            result = play(setting, done, end - done)
-            before = tried.get(setting)
-            tried[setting] = Tried(setting, before.result.joined(result) if before else result)
-        reference, done = _best_cold([tried[setting] for setting in running]), end
-        running = [setting for setting in running if not _hopeless(tried[setting], reference)]
+
+    def run(setting: Setting, end: int) -> Tried:
+        before = tried.get(setting)
+        if before is None:
+            tried[setting] = Tried(setting, play(setting, 0, end))
+        elif before.episodes < end:
+            tried[setting] = Tried(setting, before.result.joined(play(setting, before.episodes, end - before.episodes)))
+        return tried[setting]
+
+    first = screened_on(episodes)
+    cold = [run(setting, first) for setting in settings if setting.options.streaming is False]
+    best = _best_cold(cold)
+    reference = _best_cold([run(one.setting, episodes) for one in cold if not _hopeless(one, best)])
+    others = [run(setting, first) for setting in settings if setting.options.streaming is not False]
+    fewest = reference.evaluations
+    for one in sorted((one for one in others if not _hopeless(one, reference)), key=lambda one: one.evaluations):
+        if one.evaluations > fewest + EVALUATIONS_ALIKE:
+            break
+        whole = run(one.setting, episodes)
+        if _verdict(whole, reference) == "qualifies":
+            fewest = min(fewest, whole.evaluations)
     return [tried[setting] for setting in settings]
 
 
@@ -210,9 +234,8 @@ class Choice:
         return [one for one in self.tried if self.verdict(one) in ("chosen", "reference", "qualifies")]
 
     def gap(self, one: Tried) -> Gap:
-        """How far below the reference, on the episodes that both have."""
-        above = self.reference.result
-        return Gap.between(one.result, replace(above, episodes=above.episodes[: one.episodes]))
+        """How far below the reference, on the episodes that it was run on."""
+        return Gap.between(one.result, self.reference.result)
 
     def verdict(self, one: Tried) -> str:
         """One word or two on a setting."""
@@ -244,14 +267,14 @@ def decide(tried: Sequence[Tried]) -> Choice:
     finalists = [one for one in tried if one.episodes == episodes]
     reference = _best_cold(finalists)
     good = [one for one in finalists if one is reference or _verdict(one, reference) == "qualifies"]
-    fewest = min(one.result.evaluations_per_act for one in good)
-    cheap = [one for one in good if one.result.evaluations_per_act <= fewest + EVALUATIONS_ALIKE]
+    fewest = min(one.evaluations for one in good)
+    cheap = [one for one in good if one.evaluations <= fewest + EVALUATIONS_ALIKE]
     return Choice(list(tried), reference, max(cheap, key=lambda one: one.result.mean_return))
 
 
 def _verdict(one: Tried, reference: Tried) -> str:
     if one.episodes < reference.episodes:
-        return f"dropped after {one.episodes}"
+        return "far below" if _hopeless(one, reference) else "dearer"
     gap = Gap.between(one.result, reference.result)
     if gap.mean > gap.error:
         return "below"
