@@ -15,7 +15,7 @@ from ada_diffuser import SamplerOptions
 from ada_diffuser.commands import evaluate as evaluate_command
 from ada_diffuser.messages import Missing, Model, Trained
 from ada_diffuser.rollout import ActLog, Episode, Evaluation, Trial
-from ada_diffuser.rollout.clusters import adjusted_rand_index, cluster, kmeans
+from ada_diffuser.rollout.clusters import Clusters, adjusted_rand_index, cluster, kmeans
 from ada_diffuser.rollout.plot import save_latents
 from ada_diffuser.rollout.readout import AgeError, Readout, fit, read
 from ada_diffuser.rollout.report import readout_table
@@ -148,6 +148,9 @@ def test_the_rand_index_and_purity_have_their_known_values() -> None:
     a, b = np.array([0, 0, 1, 1]), np.array([0, 0, 1, 2])
     assert adjusted_rand_index(a, b) == pytest.approx(4 / 7) == adjusted_rand_index(b, a)
     assert adjusted_rand_index(a, a[::-1]) == 1 and adjusted_rand_index(a, np.array([0, 1, 0, 1])) == pytest.approx(-0.5)
+    one_group = Clusters(np.zeros((4, 2)), (1.0, 0.0), bins=a, groups=np.zeros(4, np.int64))
+    assert one_group.purity == 0.5 and one_group.adjusted_rand_index == 0
+    assert replace(one_group, groups=b).purity == 1, "smaller groups are as pure"
     rng = np.random.default_rng(0)
     assert abs(adjusted_rand_index(rng.integers(5, size=5000), rng.integers(5, size=5000))) < 0.01
 
@@ -168,9 +171,12 @@ def test_groups_of_latents_are_held_against_bins_of_the_context() -> None:
     assert speeds.as_json() == {"groups": 2, "acts": 1000, "adjusted_rand_index": 1.0, "purity": 1.0}, "two speeds are two bins"
 
 
-def test_kmeans_is_the_same_each_time_and_stands_equal_points() -> None:
+def test_kmeans_ends_where_each_point_is_nearest_to_its_own_groups_mean() -> None:
     points = np.random.default_rng(2).normal(size=(300, 4))
-    assert np.array_equal(kmeans(points, 5), kmeans(points, 5)) and set(kmeans(points, 5)) == set(range(5))
+    groups = kmeans(points, 5)
+    means = np.stack([points[groups == group].mean(axis=0) for group in range(5)])
+    assert np.array_equal(np.linalg.norm(points[:, None] - means, axis=2).argmin(axis=1), groups)
+    assert np.array_equal(kmeans(points, 5), groups)
     assert set(kmeans(np.ones((10, 2)), 3)) == {0}
 
 

@@ -97,7 +97,7 @@ def combinations(words: Sequence[str]) -> Iterator[SamplerOptions]:
 def _run(arguments: argparse.Namespace) -> None:
     if arguments.seed is None:
         arguments.seed = choose.FIRST_SEED if arguments.choose else 1000
-    for flag, needs in (("write", "choose"), ("programs", "choose"), ("plot", "readout")):
+    for flag, needs in (("write", "choose"), ("plot", "readout")):
         if getattr(arguments, flag) and not getattr(arguments, needs):
             raise ValueError(f"--{flag} belongs to --{needs}")
     if not arguments.choose:
