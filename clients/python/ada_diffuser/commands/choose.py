@@ -91,13 +91,13 @@ class _Runner:
 
     def play(self, setting: Setting, offset: int, episodes: int) -> Evaluation:
         from ada_diffuser.rollout import evaluate
+        from ada_diffuser.rollout.report import outcome
 
         title = setting.label()
         with progress(episodes * self.steps_max, title, "step") as advance:
             result = evaluate(self.client, self._trial(setting, offset, episodes), advance)
         if not self.arguments.markdown:
-            outcome = f"{result.mean_return:.2f} ± {result.standard_error:.2f}, {result.failures} failed, {result.wall_s:.1f} s"
-            print(f"episodes {offset} to {offset + episodes - 1}: {title} {outcome}", file=sys.stderr, flush=True)
+            print(f"episodes {offset} to {offset + episodes - 1}: {title} {outcome(result)}", file=sys.stderr, flush=True)
         return result
 
     def _trial(self, setting: Setting, offset: int, episodes: int) -> Any:

@@ -182,9 +182,10 @@ def _entries(results: Sequence[Evaluation], readings: Sequence[Reading]) -> list
 
 
 def _line(result: Evaluation, which: str) -> str:
+    from ada_diffuser.rollout.report import outcome
+
     settings = " ".join(f"{name}={value}" for name, value in result.trial.options.given().items())
-    outcome = f"{result.mean_return:.2f} ± {result.standard_error:.2f}, {result.failures} failed, {result.wall_s:.1f} s"
-    return " ".join(part for part in (which, result.model.name, settings, outcome) if part)
+    return " ".join(part for part in (which, result.model.name, settings, outcome(result)) if part)
 
 
 if __name__ == "__main__":

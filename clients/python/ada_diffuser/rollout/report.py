@@ -34,6 +34,11 @@ def table(result: Evaluation, readout: Readout | str) -> str:
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 
 
+def outcome(result: Evaluation) -> str:
+    """In a line of a log."""
+    return f"{result.mean_return:.2f} ± {result.standard_error:.2f}, {result.failures} failed, {result.wall_s:.1f} s"
+
+
 def _server_row(result: Evaluation, part: str) -> str:
     return f"p50 {result.server_ms(part, 50):.2f} ms, p99 {result.server_ms(part, 99):.2f} ms"
 
