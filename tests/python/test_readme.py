@@ -39,7 +39,8 @@ SHORT_FLAGS = {
 }
 """Added to every call of a command; the last word on a flag counts."""
 
-PORT_FLAGS = {"ada-rollout": "--url 127.0.0.1:7777", "ada-evaluate": "--url 127.0.0.1:7777"}
+PLACE_FLAGS = {"ada-rollout": "--url 127.0.0.1:7777", "ada-evaluate": f"--url 127.0.0.1:7777 --programs {BINARY.parent}"}
+"""Where the server is; and the programs themselves, for a command that starts a server of its own beside the reader's."""
 
 IN_FULL = ("docs/simulator.md",)
 """Documents whose commands are small enough to be run to their end, so that what they promise comes out."""
@@ -124,7 +125,7 @@ class Checkout:
         built.mkdir(parents=True)
         for name, flags in SHORT_FLAGS.items():
             module = f"ada_diffuser.commands.{name.removeprefix('ada-')}"
-            added = f"{flags if shortened else ''} {PORT_FLAGS.get(name, '')}"
+            added = f"{flags if shortened else ''} {PLACE_FLAGS.get(name, '')}"
             self._script(scripts / name, f'exec {sys.executable} -m {module} "$@" {added}')
         self._script(scripts / "cargo", "exit 0")
         (scripts.parent / ".ready").touch()

@@ -1,4 +1,4 @@
-"""`ada-evaluate`: models x settings on the same episodes through one running server, as one table."""
+"""`ada-evaluate`: models x settings on the same episodes through one running server, as one table; or a choice of defaults."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import itertools
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ada_diffuser.client import Client
 from ada_diffuser.commands import (
@@ -15,6 +15,7 @@ from ada_diffuser.commands import (
     add_server_arguments,
     add_trial_arguments,
     check_environment,
+    choose,
     parse_settings,
     run_command,
     server_url,
@@ -25,8 +26,9 @@ from ada_diffuser.messages import SamplerOptions
 
 if TYPE_CHECKING:
     from ada_diffuser.rollout import Evaluation, Trial
+    from ada_diffuser.rollout.readout import Reading
 
-_ABOUT = """\
+_ABOUT = f"""\
 Runs each model with each combination of settings over the same episodes (seeds SEED, SEED + 1, ...), all episodes of one
 combination side by side through ActBatch, and prints a table of mean return and standard error, median, failures,
 evaluations an act, and the latency of a batch. Models, settings and the folder of --json are checked before the first
@@ -35,7 +37,24 @@ episode; results are written to --json as each combination ends, and what was fi
 The standard error is that over episodes, and says nothing of another training. Models that are training seeds of one recipe
 (NAME-seed0, NAME-seed1, ..., as ada-trainer names them) get a row more together, with the standard error over the seeds.
 
-  ada-evaluate --env cheetah-wind-s --models a,b --episodes 50 --seed 1000 --set kappa=0,0.1,inf --set streaming=true,false"""
+  ada-evaluate --env cheetah-wind-s --models a,b --episodes 50 --seed 1000 --set kappa=0,0.1,inf --set streaming=true,false
+
+--readout adds what the latents say of the true context on these episodes, the agent's own: the squared error of a linear map
+from the latent at each act (fitted on the first half of the episodes, judged on the others) over the context's variance, by the
+step of the act in its episode. 0 knows all, 1 nothing but the mean; the errors are over episodes. And k-means with five groups of
+latents, held against five bins of the context with as many acts in each: adjusted Rand index, purity. With kappa above 0 the latent
+is the refined one, which the window itself had a part in; --set kappa=0 shows the filter's.
+
+--choose CHECKPOINT chooses a checkpoint's sampling defaults on validation episodes (by default seeds {choose.FIRST_SEED} on; the tables of
+models/README.md are of seeds from 1000 on). No server need run: the grid has keys of [restart], which no session can choose, so
+variants of the checkpoint are written to a temporary folder and served on loopback while the command runs. The grid is streaming,
+kappa, temperature, latent_jump and cold_distance, with the checkpoint's own values and some on either side; --set takes the place of a
+key's values (renoise_distance and the other sampling options too).
+{choose.RULE}
+A setting that is more than two standard errors below the best cold one after a quarter of the episodes is run no further (far below), nor
+is one that needs more evaluations than one that qualifies (dearer).
+
+  ada-evaluate --env cheetah-vel-e --choose runs/cheetah-vel-e-seed3 --json chosen.json --write shipped/cheetah-vel-e-seed3"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,11 +70,20 @@ def _parser() -> argparse.ArgumentParser:
     add_trial_arguments(parser)
     parser.add_argument("--models", default="", help="names, with commas between (default: the server's default model)")
     parser.add_argument("--episodes", type=int, default=50, help="episodes of each combination (default 50)")
-    parser.add_argument("--seed", type=int, default=1000, help="seed of the first episode (default 1000)")
+    parser.add_argument("--seed", type=int, help=f"seed of the first episode (default 1000; {choose.FIRST_SEED} with --choose)")
     parser.add_argument("--vector", type=int, default=64, metavar="N", help="episodes side by side, at most (default 64)")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=V1,V2", help="values of a sampling option")
     parser.add_argument("--json", type=Path, metavar="FILE", help="a list with the numbers and returns of each combination and recipe")
     parser.add_argument("--markdown", action="store_true", help="print the table alone, no line as each combination ends")
+    readout = parser.add_argument_group("what the latents know")
+    readout.add_argument("--readout", action="store_true", help="also read the true context out of the latents, by age in the episode")
+    readout.add_argument("--plot", type=Path, metavar="PNG", help="with --readout: latents on two axes, coloured by the true context")
+    defaults = parser.add_argument_group("choosing defaults")
+    defaults.add_argument("--choose", type=Path, metavar="CHECKPOINT", help="choose this directory's sampling defaults, by the rule above")
+    defaults.add_argument("--write", type=Path, metavar="OUT", help="with --choose: let `ada-trainer defaults` write the choice to OUT")
+    defaults.add_argument(
+        "--programs", type=Path, metavar="DIR", help="with --choose: where ada-server and ada-trainer are (default: PATH, target/release)"
+    )
     return parser
 
 
@@ -67,14 +95,27 @@ def combinations(words: Sequence[str]) -> Iterator[SamplerOptions]:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    if arguments.seed is None:
+        arguments.seed = choose.FIRST_SEED if arguments.choose else 1000
+    for flag, needs in (("write", "choose"), ("plot", "readout")):
+        if getattr(arguments, flag) and not getattr(arguments, needs):
+            raise ValueError(f"--{flag} belongs to --{needs}")
+    if not arguments.choose:
+        return _evaluate(arguments)
+    if arguments.readout:
+        raise ValueError("--choose and --readout are two commands: choose first, then read")
+    choose.run(arguments)
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
     check_output("--json", arguments.json)
+    check_output("--plot", arguments.plot, ".png", ".pdf", ".svg", ".jpg")
     settings = list(combinations(arguments.set))
     models = [model.strip() for model in arguments.models.split(",")]
     if len(models) > 1 and not all(models):
         raise ValueError(f"--models {arguments.models!r} has an empty name")
     check_environment(arguments)
     from ada_diffuser.rollout import Trial
-    from ada_diffuser.rollout.report import markdown
 
     trials = [
         Trial(
@@ -91,16 +132,32 @@ def _run(arguments: argparse.Namespace) -> None:
         for options in settings
     ]
     results: list[Evaluation] = []
+    readings: list[Reading] = []
     try:
-        _run_all(arguments, trials, results)
+        _run_all(arguments, trials, results, readings)
     finally:
-        if results:
-            print(markdown(results, list(parse_settings(arguments.set))), flush=True)
+        _tell(arguments, results, readings)
 
 
-def _run_all(arguments: argparse.Namespace, trials: Sequence[Trial], results: list[Evaluation]) -> None:
-    """Appends to `results` as each trial ends, so that the caller has them whatever ends the rest."""
+def _tell(arguments: argparse.Namespace, results: Sequence[Evaluation], readings: Sequence[Reading]) -> None:
+    from ada_diffuser.rollout.report import markdown, readout_table
+
+    settings = list(parse_settings(arguments.set))
+    if results:
+        print(markdown(results, settings), flush=True)
+    if readings:
+        print(f"\n{readout_table(readings, settings)}", flush=True)
+    if readings and arguments.plot:
+        from ada_diffuser.rollout.plot import save_latents
+
+        save_latents(readings, arguments.plot)
+        print(f"plot: {arguments.plot}")
+
+
+def _run_all(arguments: argparse.Namespace, trials: Sequence[Trial], results: list[Evaluation], readings: list[Reading]) -> None:
+    """Appends to `results` and `readings` as each trial ends, so that the caller has them whatever ends the rest."""
     from ada_diffuser.rollout import check, evaluate
+    from ada_diffuser.rollout.readout import read
     from ada_diffuser.rollout.seeds import by_recipe
 
     with Client(server_url(arguments.url, arguments.face)) as client:
@@ -112,14 +169,23 @@ def _run_all(arguments: argparse.Namespace, trials: Sequence[Trial], results: li
                 results.append(evaluate(client, trial, advance))
             if not arguments.markdown:
                 print(_line(results[-1], which), file=sys.stderr, flush=True)
+            if arguments.readout:
+                readings.append(read(results[-1]))
             if arguments.json:
-                save_json([found.as_json() for found in [*results, *by_recipe(results)]], arguments.json)
+                save_json([*_entries(results, readings), *(group.as_json() for group in by_recipe(results))], arguments.json)
+
+
+def _entries(results: Sequence[Evaluation], readings: Sequence[Reading]) -> list[dict[str, Any]]:
+    if not readings:
+        return [result.as_json() for result in results]
+    return [result.as_json() | reading.as_json() for result, reading in zip(results, readings, strict=True)]
 
 
 def _line(result: Evaluation, which: str) -> str:
+    from ada_diffuser.rollout.report import outcome
+
     settings = " ".join(f"{name}={value}" for name, value in result.trial.options.given().items())
-    outcome = f"{result.mean_return:.2f} ± {result.standard_error:.2f}, {result.failures} failed, {result.wall_s:.1f} s"
-    return " ".join(part for part in (which, result.model.name, settings, outcome) if part)
+    return " ".join(part for part in (which, result.model.name, settings, outcome(result)) if part)
 
 
 if __name__ == "__main__":

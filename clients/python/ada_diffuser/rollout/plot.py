@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ada_diffuser.rollout.readout import Readout
+from ada_diffuser.rollout.clusters import Clusters
+from ada_diffuser.rollout.readout import Reading, Readout
 from ada_diffuser.rollout.result import Episode, Evaluation
 
 #: Shown episodes stand side by side, at most so many, and so many steps of each: a wind may turn every dozen steps.
 EPISODES_SHOWN = 3
 STEPS_SHOWN = 80
+#: Latents in a picture, every so many-th of them.
+LATENTS_SHOWN = 2000
 
 
 def save_plot(result: Evaluation, readout: Readout | str, path: Path) -> None:
     """Writes the picture in the format that the suffix names (png, pdf, svg)."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
+    pyplot = _pyplot()
     figure, (rewards, returns, context) = pyplot.subplots(3, 1, figsize=(9, 9), height_ratios=(2, 2, 3), layout="constrained")
     figure.suptitle(
         f"{result.model.name} on {result.trial.env}: "
@@ -30,8 +30,45 @@ def save_plot(result: Evaluation, readout: Readout | str, path: Path) -> None:
     _draw_rewards(rewards, result)
     _draw_returns(returns, result)
     _draw_context(context, result, readout)
+    _save(figure, path)
+
+
+def save_latents(readings: Sequence[Reading], path: Path) -> None:
+    """Writes the latents of each evaluation on their two principal axes, coloured by the true context's bin and by k-means' group."""
+    shown = [(one, one.clusters) for one in readings if one.clusters]
+    if not shown:
+        raise ValueError(f"there are no latents to draw: {readings[0].readout}")
+    figure, axes = _pyplot().subplots(len(shown), 2, figsize=(10, 4.5 * len(shown)), squeeze=False, layout="constrained")
+    for (left, right), (one, clusters) in zip(axes, shown, strict=True):
+        _draw_plane(left, clusters, clusters.bins, "bin of the true context, low to high")
+        options = " ".join(f"{name}={value}" for name, value in one.result.trial.options.given().items())
+        left.set_title(f"{one.result.model.name} on {one.result.trial.env} {options}", fontsize=10)
+        _draw_plane(right, clusters, clusters.groups, "group by k-means")
+        right.set_title(f"adjusted Rand index {clusters.adjusted_rand_index:.2f}, purity {clusters.purity:.2f}", fontsize=10)
+    _save(figure, path)
+
+
+def _draw_plane(axes: Any, clusters: Clusters, labels: np.ndarray[Any, Any], title: str) -> None:
+    step = -(-len(labels) // LATENTS_SHOWN)
+    for label in range(int(labels.max()) + 1):
+        x, y = clusters.plane[::step][labels[::step] == label].T
+        axes.plot(x, y, ".", markersize=3, alpha=0.6, color=f"C{label}", label=str(label))
+    axes.set(xlabel=f"first axis, {100 * clusters.shares[0]:.0f} % of the variance", ylabel=f"second, {100 * clusters.shares[1]:.0f} %")
+    axes.legend(title=title, title_fontsize=8, ncols=5, fontsize=8, markerscale=3, loc="best")
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def _save(figure: Any, path: Path) -> None:
     figure.savefig(path, dpi=120, metadata={"Software": None} if path.suffix == ".png" else None)
-    pyplot.close(figure)
+    _pyplot().close(figure)
 
 
 def _draw_rewards(axes: Any, result: Evaluation) -> None:

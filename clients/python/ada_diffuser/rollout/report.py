@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import fmean
 
-from ada_diffuser.rollout.readout import Readout
+from ada_diffuser.rollout.choice import Choice, Tried
+from ada_diffuser.rollout.readout import AgeError, Reading, Readout
 from ada_diffuser.rollout.result import Evaluation
 from ada_diffuser.rollout.seeds import SeedGroup, by_recipe
 
@@ -33,6 +34,11 @@ def table(result: Evaluation, readout: Readout | str) -> str:
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 
 
+def outcome(result: Evaluation) -> str:
+    """In a line of a log."""
+    return f"{result.mean_return:.2f} ± {result.standard_error:.2f}, {result.failures} failed, {result.wall_s:.1f} s"
+
+
 def _server_row(result: Evaluation, part: str) -> str:
     return f"p50 {result.server_ms(part, 50):.2f} ms, p99 {result.server_ms(part, 99):.2f} ms"
 
@@ -51,7 +57,7 @@ def markdown(results: Sequence[Evaluation], settings: Sequence[str]) -> str:
         at = heads.index(error)
         for row in [heads, *rows]:
             del row[at]
-    return "\n".join(["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads), *("| " + " | ".join(row) + " |" for row in rows)])
+    return _rows(heads, rows)
 
 
 def _trial_cells(result: Evaluation, settings: Sequence[str]) -> list[str]:
@@ -83,6 +89,58 @@ def _group_cells(group: SeedGroup, settings: Sequence[str]) -> list[str]:
         "",
         "",
     ]
+
+
+def choice_table(choice: Choice) -> str:
+    """One row a setting, in Markdown: what it earned, and how far that is below the best cold one's, episode by episode."""
+    names = list(dict.fromkeys(name for one in choice.tried for name in one.setting.values()))
+    heads = [*names, "episodes", "return", "median", "failures", "evaluations/act", "below cold's best", "verdict"]
+    return _rows(heads, [_tried_cells(one, choice, names) for one in choice.tried])
+
+
+def _tried_cells(one: Tried, choice: Choice, names: Sequence[str]) -> list[str]:
+    result, gap, values, verdict = one.result, choice.gap(one), one.setting.values(), choice.verdict(one)
+    return [
+        *(_setting(values[name]) if name in values else "" for name in names),
+        str(one.episodes),
+        f"{result.mean_return:.2f} ± {result.standard_error:.2f}",
+        f"{result.median_return:.2f}",
+        f"{result.failures}/{one.episodes}",
+        f"{result.evaluations_per_act:.2f}",
+        "" if one is choice.reference else f"{gap.mean:.2f} ± {gap.error:.2f}",
+        f"**{verdict}**" if one is choice.chosen else verdict,
+    ]
+
+
+def readout_table(readings: Sequence[Reading], settings: Sequence[str]) -> str:
+    """What each latent says of the true context: the standardised squared error of a linear map from it, by age in the episode."""
+    errors = [[] if isinstance(one.readout, str) else one.readout.by_age() for one in readings]
+    ages = list(dict.fromkeys(error.age for of_one in errors for error in of_one))
+    heads = [
+        "environment",
+        "model",
+        *settings,
+        "latent",
+        *(f"steps {first} to {last - 1}" for first, last in ages),
+        "k-means: Rand index, purity",
+    ]
+    return _rows(heads, [_reading_cells(one, of_one, settings, ages) for one, of_one in zip(readings, errors, strict=True)])
+
+
+def _reading_cells(one: Reading, errors: Sequence[AgeError], settings: Sequence[str], ages: Sequence[tuple[int, int]]) -> list[str]:
+    by_age = {error.age: f"{error.mse:.3f} ± {error.standard_error:.3f}" for error in errors}
+    return [
+        one.result.trial.env,
+        one.result.model.name,
+        *(_setting(getattr(one.result.options, name)) for name in settings),
+        one.readout if isinstance(one.readout, str) else one.evidence,
+        *(by_age.get(age, "") for age in ages),
+        f"{one.clusters.adjusted_rand_index:.2f}, {one.clusters.purity:.2f}" if one.clusters else "",
+    ]
+
+
+def _rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join(["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads), *("| " + " | ".join(row) + " |" for row in rows)])
 
 
 def _setting(value: object) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -76,6 +76,16 @@ class ActLog:
         self.evaluations += sum(chunk.evaluations for chunk in chunks)
         self.timings.extend(chunk.timings for chunk in chunks)
 
+    def joined(self, more: ActLog) -> ActLog:
+        """Both together, as a new one."""
+        return ActLog(
+            self.call_ms + more.call_ms,
+            self.acts + more.acts,
+            self.replayed + more.replayed,
+            self.evaluations + more.evaluations,
+            self.timings + more.timings,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -89,6 +99,14 @@ class Evaluation:
     episodes: list[Episode]
     acts: ActLog
     wall_s: float
+
+    def joined(self, more: Evaluation) -> Evaluation:
+        """These episodes and those of `more`, which go on where these end: what one trial of all of them would have brought."""
+        if more.trial.seed != self.trial.seed + len(self.episodes) or more.options != self.options:
+            raise ValueError("only episodes with the next seeds and the same options can be joined")
+        episodes = self.episodes + more.episodes
+        trial = replace(self.trial, episodes=len(episodes))
+        return replace(self, trial=trial, episodes=episodes, acts=self.acts.joined(more.acts), wall_s=self.wall_s + more.wall_s)
 
     @property
     def returns(self) -> NDArray[np.float64]:

@@ -71,6 +71,12 @@ class SeedGroup:
         return np.stack([result.returns for result in self.results])
 
 
+def training_seed(model: str) -> int | None:
+    """N of a model's name `...-seedN`; None of another name."""
+    found = _SEED.search(model)
+    return int(found[1]) if found else None
+
+
 def by_recipe(results: Sequence[Evaluation]) -> list[SeedGroup]:
     """Groups of `NAME-seed0`, `NAME-seed1`, ... with equal settings, in the order of `results`; one model alone is no group."""
     groups: dict[Any, dict[str, Evaluation]] = {}
