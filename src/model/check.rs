@@ -88,12 +88,13 @@ impl ModelConfig {
             Schedule::Uniform { steps } => size("method.plan.schedule.steps", *steps, *level_max)?,
         }
         if let Some(gru) = latent.gru() {
-            let GruLatent { dim, hidden, looks: _, future, stays, baseline, actions: _ } = gru;
+            let GruLatent { dim, hidden, looks: _, future, stays, baseline, tells, actions: _ } = gru;
             size("method.latent.dim", *dim, WIDTH_MAX)?;
             size("method.latent.hidden", *hidden, WIDTH_MAX)?;
             if let Some(Baseline { width }) = baseline {
                 size("method.latent.baseline.width", *width, WIDTH_MAX)?;
             }
+            require(*tells <= COLUMNS_MAX, "method.latent.tells", format!("is {tells}, at most {COLUMNS_MAX} are allowed"))?;
             let moves = *future == Future::Held || *stays < *dim;
             require(
                 *stays <= *dim && moves,

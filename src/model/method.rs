@@ -45,6 +45,10 @@ pub struct GruLatent {
     /// What needs no context; the latent explains the rest. Absent: it explains all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub baseline: Option<Baseline>,
+    /// Columns of the recorded context that a linear head tells from the latent in training: what a simulator knows, and a robot does not.
+    /// 0: the latent is found from what happened alone, as in the paper.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub tells: usize,
     /// Whether actions tell of what is hidden.
     #[serde(default, skip_serializing_if = "Actions::are_evidence")]
     pub actions: Actions,
@@ -178,6 +182,11 @@ impl LatentSource {
         self.gru().and_then(|gru| gru.baseline)
     }
 
+    /// Columns of a recorded context that the latent tells; 0 where it tells none.
+    pub fn tells(&self) -> usize {
+        self.gru().map_or(0, |gru| gru.tells)
+    }
+
     /// Width of the latent; 0 without one.
     pub fn dim(&self) -> usize {
         self.gru().map_or(0, |gru| gru.dim)
@@ -202,7 +211,7 @@ impl Looks {
 impl GruLatent {
     /// The latent of the paper: all of it moves by a learned prior, explains all, and sees all.
     pub fn plain(dim: usize, hidden: usize, looks: Looks) -> Self {
-        Self { dim, hidden, looks, future: Future::Prior, stays: 0, baseline: None, actions: Actions::Evidence }
+        Self { dim, hidden, looks, future: Future::Prior, stays: 0, baseline: None, tells: 0, actions: Actions::Evidence }
     }
 
     /// Width of the state that goes on from act to act; 0 where each looks anew.

@@ -30,11 +30,11 @@ pub mod tensorboard;
 #[cfg(test)]
 mod tests;
 
-use crate::model::{checkpoint::is_name, config::ModelConfig, method::Looks};
+use crate::model::{checkpoint::is_name, config::ModelConfig, method::Looks, normalizer::Affine};
 use anyhow::{Context, Result, ensure};
 use crank::Crank;
 use dataset::{
-    Split, UnitsFrom, hdf5,
+    Episode, Split, UnitsFrom, hdf5,
     room::Room,
     units::{self, ActionColumn},
 };
@@ -45,6 +45,7 @@ use recipe::Recipe;
 use resume::Store;
 use std::{
     fs::{self, File},
+    io,
     path::{Path, PathBuf},
     sync::{Arc, atomic::AtomicBool},
 };
@@ -89,6 +90,8 @@ pub struct Task {
     pub dataset_digest: String,
     /// The architecture, without the latent spread, which only training tells.
     pub config: ModelConfig,
+    /// Units of the recorded context, those of the training episodes; of no columns where none is told.
+    pub context_units: Affine,
     /// What a person should know about the data.
     pub notes: Vec<String>,
 }
@@ -105,12 +108,19 @@ impl Task {
         if let Some(key) = recipe.probe_key() {
             ensure!(dataset.context_dim() > 0, "recipe: `{key}`: {} has no `infos/context` to probe for", recipe.data.display());
         }
+        let (tells, recorded) = (recipe.model.latent.tells(), dataset.context_dim());
+        ensure!(
+            tells == 0 || tells == recorded,
+            "recipe: `model.latent.tells`: is {tells}, but `infos/context` in {} has {recorded} columns",
+            recipe.data.display()
+        );
         let (layout, notes, dataset_digest) = (dataset.layout(), std::mem::take(&mut dataset.notes), dataset.digest.clone());
         let (split, action_columns) = dataset.split(UnitsFrom::Data(&recipe.actions))?;
         let config = ModelConfig { units: split.units.clone(), ..recipe.config(layout) };
         // The recipe was checked with plain units; now the data's are known.
         config.check().with_context(|| format!("data set {} makes no model", recipe.data.display()))?;
-        let task = Self { recipe, split, action_columns, dataset_digest, config, notes };
+        let context_units = units_of_context(&split.train, tells)?;
+        let task = Self { context_units, recipe, split, action_columns, dataset_digest, config, notes };
         if let Some(key) = task.recipe.probe_key() {
             ensure!(
                 gate::contexts_vary(&task)?,
@@ -126,6 +136,18 @@ impl Task {
     pub fn looks(&self) -> Looks {
         self.config.method.latent.gru().map_or(Looks::Block(0), |gru| gru.looks)
     }
+}
+
+/// Mean and standard deviation of each of the columns over these episodes.
+fn units_of_context(episodes: &[Episode], columns: usize) -> Result<Affine> {
+    let steps = || episodes.iter().filter(|_| columns > 0).flat_map(|episode| (0..episode.len()).map(move |t| (episode, t)));
+    let scan = |visit: &mut dyn FnMut(&[f32])| -> io::Result<()> {
+        steps().try_for_each(|(episode, t)| {
+            visit(&episode.context(t)?);
+            Ok(())
+        })
+    };
+    Ok(Affine::fit(columns, scan)?)
 }
 
 /// Trains a recipe to the end, from where an earlier run in the same directory stopped.

@@ -18,6 +18,8 @@ pub struct ElboBatch {
     pub successor_shown: Tensor,
     /// `(B, L - 1, dim)` Gaussian draws of the latents.
     pub eps: Tensor,
+    /// `(B, L - 1, tells)`: the context of each step in standard deviations of the data, of a latent that tells it.
+    pub context: Option<Tensor>,
     /// `(B, 1, L - 1)`: 1 at the step whose belief has to explain the whole row by the columns that stay, before the last step; of a latent
     /// that has such columns.
     pub believed: Option<Tensor>,
@@ -36,6 +38,8 @@ pub struct ElboOptions {
     pub reward_weight: f64,
     /// Weight of the action's squared error; beside a baseline.
     pub action_weight: f64,
+    /// Weight of the squared error of a recorded context, where it is told.
+    pub context_weight: f64,
     /// Nats of a step's KL that cost nothing (Kingma et al. 2016).
     pub free_bits: f64,
     /// Predictions of later steps.
@@ -64,6 +68,8 @@ pub struct ElboTerms {
     pub reward_error: Tensor,
     /// The same of actions, beside a baseline.
     pub action_error: Option<Tensor>,
+    /// Mean squared error of a recorded context, standard deviations of the data, where it is told.
+    pub context_error: Option<Tensor>,
     /// Weighted errors of the steps ahead, their mean; half sums beside a baseline.
     pub ahead: Option<Tensor>,
     /// KL(q || p), summed over latent dimensions, mean over positions.
@@ -125,7 +131,7 @@ impl LatentModel {
         let Explained { q, from } = self.explained(surprises.as_ref(), batch)?;
         let (steps, valid) = (len - 1 - from, batch.valid.narrow(1, from, len - 1 - from)?);
         let (latent, stays) = self.drawn(&q, batch, from)?;
-        let aims = Aims::new(&batch.tokens, surprises.as_ref(), from, options)?;
+        let aims = Aims::new(batch, surprises.as_ref(), from, options)?;
         let now = batch.tokens.narrow(from, steps)?;
         let errors = self.errors(&now, &latent, &aims, &valid)?;
         let kl = self.block_kl(&q, stays.as_ref(), &valid, options.free_bits)?;
@@ -134,8 +140,8 @@ impl LatentModel {
         if let Some(error) = &ahead {
             loss = (loss + error.affine(options.ahead.weight, 0.0)?)?;
         }
-        let Errors { state: state_error, reward: reward_error, action: action_error } = errors;
-        Ok(ElboTerms { loss, state_error, reward_error, action_error, ahead, kl })
+        let Errors { state: state_error, reward: reward_error, action: action_error, context: context_error } = errors;
+        Ok(ElboTerms { loss, state_error, reward_error, action_error, context_error, ahead, kl })
     }
 
     /// How far what latents say of steps is from what they have to explain: means over valid steps and columns.
@@ -150,6 +156,7 @@ impl LatentModel {
             state: error(told.state, &aims.state)?,
             reward: error(told.reward, &aims.reward)?,
             action: told.action.zip(aims.action.as_ref()).map(|(told, aim)| error(told, aim)).transpose()?,
+            context: told.context.zip(aims.context.as_ref()).map(|(told, aim)| error(told, aim)).transpose()?,
         })
     }
 
@@ -159,9 +166,12 @@ impl LatentModel {
         let half = |width: usize| if self.baseline.is_some() { width as f64 / 2.0 } else { 1.0 };
         let times = |error: &Tensor, weight: f64| if weight == 1.0 { Ok(error.clone()) } else { error.affine(weight, 0.0) };
         let state = times(&errors.state, options.state_weight * half(state_dim))?;
-        let sum = (state + errors.reward.affine(options.reward_weight * half(1), 0.0)?)?;
-        match &errors.action {
-            Some(error) => sum + error.affine(options.action_weight * half(action_dim), 0.0)?,
+        let mut sum = (state + errors.reward.affine(options.reward_weight * half(1), 0.0)?)?;
+        if let Some(error) = &errors.action {
+            sum = (sum + error.affine(options.action_weight * half(action_dim), 0.0)?)?;
+        }
+        match &errors.context {
+            Some(error) => sum + error.affine(options.context_weight, 0.0)?,
             None => Ok(sum),
         }
     }
@@ -250,24 +260,28 @@ struct Aims {
     state: Tensor,
     reward: Tensor,
     action: Option<Tensor>,
+    context: Option<Tensor>,
 }
 
 impl Aims {
     /// From step `from` of a block on.
-    fn new(tokens: &Tokens, surprises: Option<&Surprises>, from: usize, options: &ElboOptions) -> Result<Self> {
+    fn new(batch: &ElboBatch, surprises: Option<&Surprises>, from: usize, options: &ElboOptions) -> Result<Self> {
+        let tokens = &batch.tokens;
         let steps = tokens.batch_len()?.1 - 1 - from;
         let cut = |tensor: &Tensor, at: usize| tensor.narrow(1, at, steps)?.contiguous();
+        let context = batch.context.as_ref().map(|context| cut(context, from)).transpose()?;
         let Some(Surprises { state, action, reward }) = surprises else {
             let change = (cut(&tokens.state, from + 1)? - cut(&tokens.state, from)?)?;
             let std = Tensor::new(options.state_change_std.as_slice(), change.device())?;
-            return Ok(Self { state: change.broadcast_div(&std)?, reward: cut(&tokens.reward, from)?, action: None });
+            return Ok(Self { state: change.broadcast_div(&std)?, reward: cut(&tokens.reward, from)?, action: None, context });
         };
-        Ok(Self { state: cut(state, from + 1)?, reward: cut(reward, from)?, action: Some(cut(action, from)?) })
+        Ok(Self { state: cut(state, from + 1)?, reward: cut(reward, from)?, action: Some(cut(action, from)?), context })
     }
 
     fn narrow(&self, start: usize, len: usize) -> Result<Self> {
         let cut = |tensor: &Tensor| tensor.narrow(1, start, len)?.contiguous();
-        Ok(Self { state: cut(&self.state)?, reward: cut(&self.reward)?, action: self.action.as_ref().map(cut).transpose()? })
+        let told = |tensor: &Option<Tensor>| tensor.as_ref().map(cut).transpose();
+        Ok(Self { state: cut(&self.state)?, reward: cut(&self.reward)?, action: told(&self.action)?, context: told(&self.context)? })
     }
 }
 
@@ -276,6 +290,7 @@ struct Errors {
     state: Tensor,
     reward: Tensor,
     action: Option<Tensor>,
+    context: Option<Tensor>,
 }
 
 /// See [`LatentModel::explained`].

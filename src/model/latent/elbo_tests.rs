@@ -25,6 +25,7 @@ fn options() -> ElboOptions {
         reward_weight: 0.7,
         action_weight: 0.6,
         free_bits: 0.0,
+        context_weight: 0.9,
         ahead: Ahead::default(),
     }
 }
@@ -55,6 +56,7 @@ fn batch() -> ElboBatch {
         history_shown: Tensor::from_vec(shown, (BATCH, LEN, 3), &Device::Cpu).unwrap(),
         successor_shown: tensor(present, 3),
         eps: tensor(draw(BATCH * (LEN - 1) * DIM), DIM),
+        context: None,
         believed: None,
     }
 }
@@ -121,6 +123,20 @@ fn gradient_of_steps_ahead() {
         let params = Params::fresh(6);
         check_gradient(&params, &model_of(future, &params), &batch(), &options);
     }
+}
+
+/// The same of a recorded context that is told, in the step itself and in later ones.
+#[test]
+fn gradient_of_a_told_context() {
+    let options = ElboOptions { ahead: Ahead { steps: 2, weight: 0.5 }, ..options() };
+    let latent = GruLatent { tells: 2, ..GruLatent::plain(DIM, 7, Looks::Block(4)) };
+    let params = Params::fresh(6);
+    let model = LatentModel::new(&latent, layout(), &params).unwrap();
+    let numbers = (0..BATCH * (LEN - 1) * 2).map(|i| (i as f32).sin()).collect();
+    let context = Some(Tensor::from_vec(numbers, (BATCH, LEN - 1, 2), &Device::Cpu).unwrap());
+    let terms = model.elbo(&ElboBatch { context: context.clone(), ..batch() }, &options).unwrap();
+    assert!(terms.context_error.unwrap().to_scalar::<f32>().unwrap() > 0.1);
+    check_gradient(&params, &model, &ElboBatch { context, ..batch() }, &options);
 }
 
 fn check_gradient(params: &Params, model: &LatentModel, batch: &ElboBatch, options: &ElboOptions) {

@@ -2,7 +2,8 @@
 
 use super::{Gaussian, gaussian::LOG_VAR, mlp::Mlp};
 use crate::model::{
-    nn::{Activations, params::Params},
+    method::GruLatent,
+    nn::{Activations, Linear, params::Params},
     trajectory::Layout,
 };
 use candle_core::Result;
@@ -48,6 +49,8 @@ pub struct Decoder {
     state: Mlp,
     reward: Mlp,
     action: Option<Mlp>,
+    /// A context that was recorded, where one is told.
+    context: Option<Linear>,
     layout: Layout,
 }
 
@@ -59,16 +62,20 @@ pub struct Told<V> {
     pub reward: V,
     /// `(.., action_dim)`, beside a baseline.
     pub action: Option<V>,
+    /// `(.., context_dim)`, standard deviations of the data, where a recorded context is told.
+    pub context: Option<V>,
 }
 
 impl Decoder {
-    pub(super) fn new(dim: usize, layout: Layout, acts: bool, params: &Params) -> Result<Self> {
+    pub(super) fn new(config: &GruLatent, layout: Layout, params: &Params) -> Result<Self> {
+        let (dim, acts, tells) = (config.dim, config.baseline.is_some(), config.tells > 0);
         let d_in = layout.dim() + dim;
         let action = || Mlp::new(layout.state_dim + dim, DECODER_WIDTH, layout.action_dim, &params.scope("action"));
         Ok(Self {
             state: Mlp::new(d_in, DECODER_WIDTH, layout.state_dim, &params.scope("state"))?,
             reward: Mlp::new(d_in, DECODER_WIDTH, 1, &params.scope("reward"))?,
             action: acts.then(action).transpose()?,
+            context: tells.then(|| Linear::new(dim, config.tells, &params.scope("context"))).transpose()?,
             layout,
         })
     }
@@ -86,6 +93,7 @@ impl Decoder {
         let x = V::beside(&[state, action, latent])?;
         let of_action = |network: &Mlp| network.forward(&V::beside(&[state, latent])?);
         let action = self.action.as_ref().map(of_action).transpose()?;
-        Ok(Told { state: self.state.forward(&x)?, reward: self.reward.forward(&x)?, action })
+        let context = self.context.as_ref().map(|head| head.forward(latent)).transpose()?;
+        Ok(Told { state: self.state.forward(&x)?, reward: self.reward.forward(&x)?, action, context })
     }
 }

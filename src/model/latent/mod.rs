@@ -53,7 +53,7 @@ impl LatentModel {
                 Future::Prior => Some(Prior::new(config.dim, config.stays, &params.scope("prior"))?),
                 Future::Held => None,
             },
-            decoder: Decoder::new(config.dim, layout, config.baseline.is_some(), &params.scope("decoder"))?,
+            decoder: Decoder::new(config, layout, &params.scope("decoder"))?,
             stays: config.stays,
         })
     }

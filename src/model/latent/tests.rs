@@ -111,12 +111,21 @@ fn elbo_against_pytorch() {
         reward_weight: 0.7,
         action_weight: 0.6,
         free_bits: 0.0,
+        context_weight: 0.0,
         ahead: Ahead::default(),
     };
     Golden::of("elbo").check_training(|given, params| {
         let [valid, history_shown, successor_shown, eps] =
             ["valid", "history_shown", "successor_shown", "eps"].map(|name| given[name].clone());
-        let batch = ElboBatch { tokens: tokens_of(|name| given[name].clone()), valid, history_shown, successor_shown, eps, believed: None };
+        let batch = ElboBatch {
+            tokens: tokens_of(|name| given[name].clone()),
+            valid,
+            history_shown,
+            successor_shown,
+            eps,
+            context: None,
+            believed: None,
+        };
         let terms = LatentModel::new(&golden_latent(2, 7), LAYOUT, params)?.elbo(&batch, &options)?;
         let named = [("loss", terms.loss), ("state_error", terms.state_error), ("reward_error", terms.reward_error), ("kl", terms.kl)];
         Ok(named.map(|(name, term)| (name.into(), term)).into())

@@ -9,6 +9,7 @@ use crate::model::{
     latent::{Tokens, elbo::ElboBatch},
     method::Looks,
     noise::Philox,
+    normalizer::Affine,
     trajectory::{Layout, Seen},
 };
 use candle_core::{Device, Result, Tensor};
@@ -116,6 +117,8 @@ pub struct BlockShape {
     pub latent_dim: usize,
     /// Whether columns of it stay, so that one belief has to explain a block.
     pub stays: bool,
+    /// Units of the recorded context, of a latent that tells it.
+    pub context: Option<Affine>,
     /// Probability that the posterior sees the successor's action.
     pub show_action: f32,
     /// Probability that it sees the successor's reward, given that it sees the action.
@@ -142,7 +145,7 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
     let steps = shape.len - 1;
     let mut rows = TokenRows::new(episodes[0].layout);
     let (mut valid, mut history) = (Vec::with_capacity(shape.batch * steps), Vec::with_capacity(shape.batch * shape.len * 3));
-    let mut successor = Vec::with_capacity(shape.batch * steps * 3);
+    let (mut successor, mut context) = (Vec::with_capacity(shape.batch * steps * 3), Vec::new());
     for _ in 0..shape.batch {
         let (episode, start) = places.draw(rng);
         let hidden = shape.hide.draw(rng);
@@ -154,13 +157,20 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
             let action = rng.uniform() < shape.show_action;
             let reward = rng.uniform() < shape.show_reward && action;
             valid.push(f32::from(t >= 0));
+            if let Some(units) = &shape.context {
+                let mut row = episodes[episode].context(usize::try_from(t).unwrap_or(0))?.into_owned();
+                units.normalize_in_place(&mut row);
+                context.extend(row);
+            }
             let ever = hidden.ever();
             successor.extend([1.0, f32::from(action && ever.action), f32::from(reward && ever.reward)]);
         }
     }
     let eps = (0..shape.batch * steps * shape.latent_dim).map(|_| rng.normal()).collect();
+    let tells = |units: &Affine| Tensor::from_vec(std::mem::take(&mut context), (shape.batch, steps, units.dim()), &Device::Cpu);
     let believed = shape.stays.then(|| believed(&valid, steps, rng));
     Ok(ElboBatch {
+        context: shape.context.as_ref().map(tells).transpose()?,
         believed: believed.map(|chosen| Tensor::from_vec(chosen, (shape.batch, 1, steps), &Device::Cpu)).transpose()?,
         tokens: rows.tokens(shape.batch, shape.len)?,
         valid: Tensor::from_vec(valid, (shape.batch, steps), &Device::Cpu)?,

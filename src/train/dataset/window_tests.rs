@@ -35,6 +35,7 @@ fn blocks_run_into_an_episode_and_never_out_of_it() {
         looks: Looks::Block(3),
         latent_dim: 2,
         stays: false,
+        context: None,
         show_action: 0.5,
         show_reward: 0.5,
         hide: Hide::NOTHING,
@@ -158,8 +159,17 @@ fn hidden_fields_are_hidden_from_both_networks() {
         assert!(window[row].iter().all(|step| step[0] != 0.0));
     }
     assert!(missing.iter().all(|count| *count > 100), "{missing:?}");
-    let shape =
-        BlockShape { batch: 200, len: 8, looks: Looks::Block(0), latent_dim: 2, stays: false, show_action: 1.0, show_reward: 1.0, hide };
+    let shape = BlockShape {
+        batch: 200,
+        len: 8,
+        looks: Looks::Block(0),
+        latent_dim: 2,
+        stays: false,
+        context: None,
+        show_action: 1.0,
+        show_reward: 1.0,
+        hide,
+    };
     let batch = blocks(&episodes, &Places::new(&episodes, 0, 8), &shape, &mut Philox::new(1)).unwrap();
     assert!(rows(&batch.tokens.present).iter().flatten().flatten().all(|flag| *flag == 1.0));
     let (history, successor) = (rows(&batch.history_shown), rows(&batch.successor_shown));

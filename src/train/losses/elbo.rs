@@ -45,6 +45,7 @@ impl<'a> ElboLoss<'a> {
             looks: latent.looks,
             latent_dim: latent.dim,
             stays: latent.stays > 0,
+            context: (latent.tells > 0).then(|| task.context_units.clone()),
             show_action: config.show_action,
             show_reward: config.show_reward,
             hide: task.recipe.hide,
@@ -76,6 +77,7 @@ impl<'a> ElboLoss<'a> {
             action_weight: self.config.action_weight.unwrap_or(0.0),
             free_bits: self.config.free_bits,
             ahead: self.config.ahead,
+            context_weight: self.config.context_weight.unwrap_or(0.0),
         };
         let latent = networks.latent.as_ref().context("the ELBO needs a latent model: is a bug")?;
         let terms = latent.elbo(batch, &options)?;
@@ -87,6 +89,7 @@ impl<'a> ElboLoss<'a> {
             mean("kl", &terms.kl)?,
         ];
         means.extend(terms.action_error.as_ref().map(|error| mean("action_error", error)).transpose()?);
+        means.extend(terms.context_error.as_ref().map(|error| mean("context_error", error)).transpose()?);
         means.extend(terms.ahead.as_ref().map(|error| mean("ahead", error)).transpose()?);
         Ok((terms.loss, means))
     }
@@ -110,6 +113,7 @@ impl<'a> ElboLoss<'a> {
             "reward_error" => "held_out_reward_error",
             "action_error" => "held_out_action_error",
             "ahead" => "held_out_ahead",
+            "context_error" => "held_out_context_error",
             _ => "held_out_kl",
         };
         Ok(means.into_iter().map(|mean| (held_out(mean.name), mean.sum)).collect())

@@ -76,6 +76,8 @@ pub struct ElboConfig {
     pub reward_weight: f64,
     /// Weight of the action's error, of models with a baseline: the context moves an expert's action too (section 3 of the paper).
     pub action_weight: Option<f64>,
+    /// Weight of the error of a recorded context, of latents that tell it.
+    pub context_weight: Option<f64>,
     /// Nats of a step's KL that cost nothing.
     #[serde(default)]
     pub free_bits: f64,
@@ -99,6 +101,7 @@ impl ElboConfig {
         between("losses.elbo.state_weight", self.state_weight, WEIGHTS)?;
         between("losses.elbo.reward_weight", self.reward_weight, WEIGHTS)?;
         between("losses.elbo.action_weight", self.action_weight.unwrap_or(0.0), WEIGHTS)?;
+        between("losses.elbo.context_weight", self.context_weight.unwrap_or(0.0), WEIGHTS)?;
         between("losses.elbo.ahead.weight", self.ahead.weight, WEIGHTS)?;
         between("losses.elbo.ahead.steps", self.ahead.steps, 0..=self.length - 1)?;
         between("losses.elbo.free_bits", self.free_bits, WEIGHTS)
@@ -172,6 +175,9 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
         (Some(_), None) => require(false, "losses.elbo", "is missing, but model.latent asks for it")?,
         (None, Some(_)) => require(false, "losses.elbo", "needs model.latent")?,
     }
+    let (tells, weighs) = (recipe.model.latent.tells() > 0, recipe.losses.elbo.as_ref().is_some_and(|elbo| elbo.context_weight.is_some()));
+    require(!tells || weighs, "losses.elbo.context_weight", "is missing, but model.latent.tells asks for it")?;
+    require(tells || !weighs, "losses.elbo.context_weight", "needs model.latent.tells, the columns of the context")?;
     require(recipe.losses.elbo.is_none() || used(Loss::Elbo), "losses.elbo", "is minimized by no stage")?;
     check_baseline(recipe)?;
     check_denoise(recipe)
