@@ -16,6 +16,7 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
+from .legged import HopperGravityE, WalkerMassE
 from .pendulum import PendulumGravityE
 from .pendulum_torque import PendulumTorqueS
 from .point_wind import PointWindS
@@ -29,10 +30,12 @@ __all__ = [
     "CheetahWindE",
     "CheetahWindS",
     "HiddenTask",
+    "HopperGravityE",
     "PendulumGravityE",
     "PendulumTorqueS",
     "PointWindS",
     "Search",
+    "WalkerMassE",
     "action_noise",
     "failed",
     "make",
