@@ -95,7 +95,7 @@ def test_a_file_that_is_no_expert_is_named(tmp_path):
 
 def test_recipes_fit_their_environments():
     def recipe(name, **options):
-        return recipe_for(environments.make(name, **options), options, 0, 2, TINY)
+        return recipe_for(environments.make(name, **options), options, 0, 2, 1)
 
     assert recipe("point-wind-s") is None
     assert recipe("cheetah-wind-s", gain=2.0).targets == ()

@@ -7,7 +7,6 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from ada_diffuser.commands.progress import progress
 
 if TYPE_CHECKING:
     from ada_diffuser.collect import Job
-    from ada_diffuser.experts import Expert
+    from ada_diffuser.experts import Expert, ExpertRecipe, PolicyBank
 
 _ABOUT = """\
 Let an expert that sees the hidden context fly an environment, and write the episodes as a D4RL-layout HDF5 file:
@@ -152,7 +151,7 @@ def _noise(text: str) -> tuple[float, ...]:
 def _expert(args: argparse.Namespace, job: Job, *, blind: bool) -> Expert:
     """The one given, the formula, the file beside the output if its recipe is this one, or a new search."""
     from ada_diffuser import environments
-    from ada_diffuser.experts import formula_of, import_expert, load_expert, make_expert, random_expert, recipe_for, save_expert
+    from ada_diffuser.experts import formula_of, import_expert, kept_expert, load_expert, make_expert, random_expert, recipe_for
 
     env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
     given = args.blind_expert if blind else args.expert
@@ -162,20 +161,14 @@ def _expert(args: argparse.Namespace, job: Job, *, blind: bool) -> Expert:
         return import_expert(given) if _is_function(given) else load_expert(Path(given))
     if formula := formula_of(env, blind=blind):
         return formula
-    recipe = recipe_for(env, job.options, args.expert_seed, args.expert_searches, blind=blind)
-    if args.expert_iterations:
-        recipe = replace(recipe, ars=replace(recipe.ars, iterations=args.expert_iterations))
+    recipe = recipe_for(env, job.options, args.expert_seed, args.expert_searches, args.expert_iterations, blind=blind)
     word = "blind" if blind else "expert"
-    cache = args.out.with_name(f"{args.out.stem}.{word}.npz")
-    if cache.exists():
-        expert = load_expert(cache)
-        if expert.card.get("recipe") == json.loads(json.dumps(recipe.to_json())):
-            return expert
-        print(f"{cache} has another recipe; training anew", file=sys.stderr)
-    with progress(recipe.iterations, word, "iteration", quiet=args.quiet) as advance:
-        expert = make_expert(recipe, advance)
-    save_expert(expert, cache)
-    return expert
+
+    def search(recipe: ExpertRecipe) -> PolicyBank:
+        with progress(recipe.iterations, word, "iteration", quiet=args.quiet) as advance:
+            return make_expert(recipe, advance)
+
+    return kept_expert(recipe, args.out.with_name(f"{args.out.stem}.{word}.npz"), search)
 
 
 def _is_function(text: str) -> bool:

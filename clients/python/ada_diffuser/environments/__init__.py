@@ -16,6 +16,7 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
+from .cheetah_goals import CheetahCumulativeS, CheetahDelayedS
 from .legged import HopperGravityE, WalkerMassE
 from .pendulum import PendulumGravityE
 from .pendulum_torque import PendulumTorqueS
@@ -26,6 +27,8 @@ from .task import NAMES, HiddenTask
 __all__ = [
     "NAMES",
     "ArsSettings",
+    "CheetahCumulativeS",
+    "CheetahDelayedS",
     "CheetahVelE",
     "CheetahWindE",
     "CheetahWindS",

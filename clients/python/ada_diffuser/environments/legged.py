@@ -37,6 +37,7 @@ class LeggedTask(HiddenTask, MujocoEnv):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be rgb_array or None, not {render_mode!r}")
         super().__init__(render_mode=render_mode)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / self.dt)}
         self.observation_space = spaces.Box(-np.inf, np.inf, self.observation_space.shape, np.float32)
         self._span, self._drawn = span, float("nan")
 
@@ -91,7 +92,7 @@ class HopperGravityE(LeggedTask, HopperEnv, name="hopper-gravity-e", id="ada/Hop
 
 
 class WalkerMassE(LeggedTask, Walker2dEnv, name="walker-mass-e", id="ada/WalkerMass-E-v0"):
-    """Gymnasium's Walker2d-v5 whose torso has `m` times its mass and inertia, `m ~ U(.5, 2)` drawn once an episode, the hidden context in R.
+    """Gymnasium's Walker2d-v5 whose torso has `m ~ U(.5, 2)` times its mass and inertia, drawn once an episode, the hidden context in R.
 
     Args:
         mass: least and largest factor.

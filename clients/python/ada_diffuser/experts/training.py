@@ -7,7 +7,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
@@ -80,11 +80,11 @@ def formula_of(env: gym.Env, *, blind: bool = False) -> CalledExpert | None:
 
 
 def recipe_for(
-    env: gym.Env, options: dict[str, Any], seed: int, seeds: int | None = None, ars: ArsSettings | None = None, *, blind: bool = False
+    env: gym.Env, options: dict[str, Any], seed: int, seeds: int | None = None, iterations: int | None = None, *, blind: bool = False
 ) -> ExpertRecipe | None:
     """The recipe of an environment's expert as its class wants it searched for, or None where the expert is a formula.
 
-    `seeds` and `ars` take the place of the class's own. Raises `ValueError` for an environment that has neither.
+    `seeds` and `iterations` take the place of the class's own. Raises `ValueError` for an environment that has neither.
     """
     if formula_of(env):
         return None
@@ -99,7 +99,8 @@ def recipe_for(
     if not module.startswith(environments.__name__):
         env_id = f"{module}:{env_id}"  # the processes that search must import it, too
     noise = environments.action_noise(env)
-    return ExpertRecipe(env_id, options, seed, seeds or how.searches, () if blind else targets, noise, ars or how.ars, blind)
+    ars = replace(how.ars, iterations=iterations or how.ars.iterations)
+    return ExpertRecipe(env_id, options, seed, seeds or how.searches, () if blind else targets, noise, ars, blind)
 
 
 def make_expert(recipe: ExpertRecipe, progress: Callable[[int], object] = lambda iterations: None) -> PolicyBank:
