@@ -16,7 +16,7 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
-from .cheetah_goals import CheetahCumulativeS, CheetahDelayedS
+from .cheetah_switching import CheetahCumulativeS, CheetahDelayedS, CheetahGaleS
 from .legged import HopperGravityE, WalkerMassE
 from .pendulum import PendulumGravityE
 from .pendulum_torque import PendulumTorqueS
@@ -29,6 +29,7 @@ __all__ = [
     "ArsSettings",
     "CheetahCumulativeS",
     "CheetahDelayedS",
+    "CheetahGaleS",
     "CheetahVelE",
     "CheetahWindE",
     "CheetahWindS",

@@ -60,7 +60,7 @@ class CheetahTask(HiddenTask):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance .05 s; see `gymnasium.Env.step`."""
-        action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        action = np.minimum(np.maximum(np.asarray(action, np.float64), -1.0), 1.0)  # np.clip, at a third of its time
         context = self.context
         speed = self.body.step(action, self._wind())
         reward = self._reward(speed, action)

@@ -54,19 +54,17 @@ class LeggedTask(HiddenTask, MujocoEnv):
         self._apply(self._drawn)
         mujoco.mj_resetData(self.model, self.data)  # nothing is left of the forces under the last episode's physics
         self.set_state(position, velocity)
-        return self._seen(), {**info, "context": self.context}
+        return self._get_obs().astype(np.float32), {**info, "context": self.context}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance .008 s; see `gymnasium.Env.step`."""
-        _, reward, terminated, truncated, info = super().step(np.clip(np.asarray(action, np.float64), -1.0, 1.0))
-        return self._seen(), float(reward), bool(terminated), truncated, {**info, "context": self.context}
+        clipped = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        observation, reward, terminated, truncated, info = super().step(clipped)
+        return observation.astype(np.float32), float(reward), bool(terminated), truncated, {**info, "context": self.context}
 
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode earned what it does where it soon falls or stands still."""
         return episode_return < self.failed_return
-
-    def _seen(self) -> np.ndarray:
-        return self._get_obs().astype(np.float32)
 
     def _apply(self, drawn: float) -> None:
         """Make the model one of this context, whatever it was before."""
