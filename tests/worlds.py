@@ -28,6 +28,7 @@ def main() -> None:
         prog="python -m tests.worlds", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="which environments (default: all)")
+    parser.add_argument("--only", choices=("aware", "blind"), help="only these experts")
     parser.add_argument("--episodes", type=int, default=64, metavar="N", help="of each expert (default 64)")
     parser.add_argument("--experts", type=Path, default=ROOT / "data", metavar="FOLDER", help="where experts are kept (default data)")
     parser.add_argument("--as-kept", action="store_true", help="take what is kept there, whatever its settings were")
@@ -35,8 +36,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=ROOT / "docs/worlds.json", metavar="FILE", help="(default docs/worlds.json)")
     flags = parser.parse_args()
     for name in flags.names or environments.NAMES:
-        for blind in (False, True):
-            row = measured(name, expert_of(name, flags, blind=blind), flags.episodes) | {"expert": "blind" if blind else "aware"}
+        for kind in [flags.only] if flags.only else ("aware", "blind"):
+            row = measured(name, expert_of(name, flags, blind=kind == "blind"), flags.episodes) | {"expert": kind}
             write([row], flags.json)
             print(line(row), flush=True)
 
@@ -56,7 +57,7 @@ def measured(name: str, expert: Expert, episodes: int) -> dict[str, Any]:
     flown = [_return(env, expert, SEED + episode) for episode in range(episodes)]
     summary = returns_summary(*(np.array(column) for column in zip(*flown, strict=True)))
     recipe = expert.card.get("recipe")
-    how = {"searches": recipe["seeds"], "iterations": recipe["ars"]["iterations"]} if recipe else None
+    how = {"for": recipe["env"], "searches": recipe["seeds"], "iterations": recipe["ars"]["iterations"]} if recipe else None
     return {"environment": name, "expert": "", "episodes": episodes, **summary, "search": how}
 
 
@@ -78,6 +79,7 @@ def write(rows: list[dict[str, Any]], path: Path) -> None:
     found = {(row["environment"], row["expert"]): row for row in [*kept, *rows]}
     order = [(name, expert) for name in environments.NAMES for expert in ("aware", "blind")]
     lines = [json.dumps(found[key]) for key in order if key in found]
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("[\n  " + ",\n  ".join(lines) + "\n]\n", encoding="utf-8")
 
 

@@ -15,7 +15,7 @@ from ada_diffuser import environments
 from ada_diffuser.collect import Job, collect
 from ada_diffuser.commands.collect import main
 from ada_diffuser.dataset import card_path, load_episodes
-from ada_diffuser.experts import formula_of
+from ada_diffuser.experts import formula_of, load_expert
 
 TINY = ["--episodes", "3", "--quiet", "--expert-searches", "1", "--expert-iterations", "1"]
 
@@ -138,6 +138,7 @@ def test_a_blind_expert_is_searched_for_kept_and_used_again(tmp_path):
     first = cache.stat().st_mtime_ns
     card = json.loads(card_path(path).read_text())
     assert card["blind"]["flown_seeing"] == {"episodes": 0, "returns": None} and card["blind"]["expert"]["recipe"]["targets"] == []
+    assert card["blind"]["expert"]["recipe"]["blind"] is True and load_expert(cache).sizes(1) == (17, 6)
     assert run(path, "--env", "cheetah-vel-e", "--blind", "0.5", "--seed", "9") == 0
     assert cache.stat().st_mtime_ns == first
     given = ["--expert", str(tmp_path / "x.expert.npz"), "--blind-expert", str(cache)]

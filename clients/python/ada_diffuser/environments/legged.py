@@ -24,12 +24,13 @@ MASS = (0.5, 2.0)
 class LeggedTask(HiddenTask, MujocoEnv):
     """What they share: the context `c ~ U(least, largest)`, once an episode; Gymnasium's reward, and Gymnasium's end where it falls.
 
-    A fall ends the episode (`terminated`), so episodes are of different lengths. The action is clipped to [-1, 1] before anything else.
+    A fall ends the episode, as in Gymnasium: `terminated`, and `terminals` in the data, whose episodes are of different lengths. A recipe
+    leaves out those that are shorter than its plan and its `losses.elbo.length + 1`. The action is clipped to [-1, 1] before anything else.
     """
 
     episode_steps = 400
     action_noise = (0.0, 0.05, 0.1)
-    search = Search(ars=ArsSettings(noise=0.025), practice={"_healthy_reward": 0.0})  # else the search is content to stand
+    search = Search(searches=1, ars=ArsSettings(iterations=150, noise=0.025), practice={"_healthy_reward": 0.0})  # else it learns to stand
     failed_return: ClassVar[float]
     """Below this an episode counts as failed."""
 
@@ -49,11 +50,9 @@ class LeggedTask(HiddenTask, MujocoEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; see `gymnasium.Env.reset`."""
         _, info = super().reset(seed=seed, options=options)
-        position, velocity = self.data.qpos.copy(), self.data.qvel.copy()
         self._drawn = float(np.float32(self.np_random.uniform(*self._span)))  # to the last bit what `context` tells
         self._apply(self._drawn)
-        mujoco.mj_resetData(self.model, self.data)  # nothing is left of the forces under the last episode's physics
-        self.set_state(position, velocity)
+        mujoco.mj_forward(self.model, self.data)
         return self._get_obs().astype(np.float32), {**info, "context": self.context}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
