@@ -33,6 +33,7 @@ def main() -> None:
     parser.add_argument("--experts", type=Path, default=ROOT / "data", metavar="FOLDER", help="where experts are kept (default data)")
     parser.add_argument("--as-kept", action="store_true", help="take what is kept there, whatever its settings were")
     parser.add_argument("--searches", type=int, metavar="N", help="for each policy (default: as the environment's class says)")
+    parser.add_argument("--iterations", type=int, metavar="N", help="of a search (default: as the environment's class says)")
     parser.add_argument("--json", type=Path, default=ROOT / "docs/worlds.json", metavar="FILE", help="(default docs/worlds.json)")
     flags = parser.parse_args()
     for name in flags.names or environments.NAMES:
@@ -48,7 +49,7 @@ def expert_of(name: str, flags: argparse.Namespace, *, blind: bool) -> Expert:
         return formula
     if flags.as_kept and kept.exists():
         return load_expert(kept)
-    return kept_expert(recipe_for(env, {}, 0, flags.searches, blind=blind), kept)
+    return kept_expert(recipe_for(env, {}, 0, flags.searches, flags.iterations, blind=blind), kept)
 
 
 def measured(name: str, expert: Expert, episodes: int) -> dict[str, Any]:

@@ -58,6 +58,15 @@ class CheetahGaleS(CheetahSwitching, name="cheetah-gale-s", id="ada/CheetahGale-
     The reward is that of the other winds, `-|v - 1.5| - .05 a.a`, and the context of step t the force in step t, N, against the run. No
     one gait is good in both winds, and the expert has one for each: it changes its gait in the step in which the wind turns.
 
+    What the wind is worth to know, 64 episodes from seed 1000:
+
+        gait                                                     mean return    failed
+        the expert's, that of the wind                             -68 ±  2       0
+        the best blind one known, searched for from a walk        -109 ±  5       1
+        a blind one searched for as the expert's were             -199 ±  8      18
+        the expert's for the wind from ahead, in both             -209 ± 11      30
+        the expert's for the wind from behind, in both            -229 ±  9      43
+
     Args:
         winds: the forces against the run, N; below 0: from behind.
         change: probability that a step has another of them than the last step.
