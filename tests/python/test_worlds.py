@@ -31,7 +31,9 @@ def test_every_row_is_of_an_environment_there_is_and_the_readme_prints_each():
 
 @pytest.mark.parametrize(("blind", "told"), [(False, None), (True, np.zeros(2))])
 def test_a_row_is_the_experts_returns_on_the_seeds_it_says(blind, told):
-    expert = worlds.expert_of("point-wind-s", Namespace(experts=Path("nowhere"), as_kept=False, searches=None, iterations=None), blind=blind)
+    expert = worlds.expert_of(
+        "point-wind-s", Namespace(experts=Path("nowhere"), as_kept=False, searches=None, iterations=None), blind=blind
+    )
     row = worlds.measured("point-wind-s", expert, 3)
     env, returns = environments.make("point-wind-s"), []
     for seed in (1000, 1001, 1002):

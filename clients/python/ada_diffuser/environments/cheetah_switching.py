@@ -130,6 +130,8 @@ class CheetahDelayedS(CheetahGoal, name="cheetah-delayed-s", id="ada/CheetahDela
     The context of step t is `c_t`, the wish that is made in step t. It does not act on `r_t` but on `r_{t + delay}`: who sees it
     has `delay` steps to get there. Nothing of it shows in the observation, and it shows in the reward `delay` steps later.
 
+    Cheetah-Vel-E's two gaits, whichever `c_t` wants, earn -65 ± 4 (64 episodes from seed 1000, none failed).
+
     Args:
         delay: `l` of the paper, steps of .05 s; 0 rewards at once.
         targets: the speeds, m/s.
@@ -152,6 +154,8 @@ class CheetahCumulativeS(CheetahGoal, name="cheetah-cumulative-s", id="ada/Cheet
 
     The context of step t is `c_t`, the wish that is made in step t; it acts on `r_t, ..., r_{t + horizon - 1}`. The best speed is the mean
     of the last `horizon` wishes.
+
+    Cheetah-Vel-E's two gaits, whichever `c_t` wants, earn -363 ± 22 (64 episodes from seed 1000, none failed).
 
     Args:
         horizon: `L` of the paper, steps of .05 s; 1 rewards at once.

@@ -73,6 +73,16 @@ class LeggedTask(HiddenTask, MujocoEnv):
 class HopperGravityE(LeggedTask, HopperEnv, name="hopper-gravity-e", id="ada/HopperGravity-E-v0"):
     """Gymnasium's Hopper-v5 under a gravity `g ~ U(6, 14)` m/s^2 drawn once an episode, the hidden context in R.
 
+        r = v + 1 (unless it has fallen) - .001 a.a, v in m/s                   400 steps of .008 s, fewer where it falls
+
+    What gravity is worth to know, 64 episodes from seed 1000:
+
+        the expert                         mean return    failed
+        is told the gravity                 1120 ± 22      0
+        takes it for 10, the mean            952 ± 41     14
+
+    It runs more than it hops, and most of its episodes end in a fall: of 300 with action noise 234, none before step 248.
+
     Args:
         gravity: least and largest gravity.
         render_mode: `rgb_array` or None.
@@ -90,6 +100,10 @@ class HopperGravityE(LeggedTask, HopperEnv, name="hopper-gravity-e", id="ada/Hop
 
 class WalkerMassE(LeggedTask, Walker2dEnv, name="walker-mass-e", id="ada/WalkerMass-E-v0"):
     """Gymnasium's Walker2d-v5 whose torso has `m ~ U(.5, 2)` times its mass and inertia, drawn once an episode, the hidden context in R.
+
+        r = v + 1 (unless it has fallen) - .001 a.a, v in m/s                   400 steps of .008 s, fewer where it falls
+
+    No expert has been searched for yet: what the mass is worth to know has not been measured.
 
     Args:
         mass: least and largest factor.
