@@ -130,7 +130,8 @@ class CheetahDelayedS(CheetahGoal, name="cheetah-delayed-s", id="ada/CheetahDela
     The context of step t is `c_t`, the wish that is made in step t. It does not act on `r_t` but on `r_{t + delay}`: who sees it
     has `delay` steps to get there. Nothing of it shows in the observation, and it shows in the reward `delay` steps later.
 
-    Cheetah-Vel-E's two gaits, whichever `c_t` wants, earn -65 ± 4 (64 episodes from seed 1000, none failed).
+    Cheetah-Vel-E's two gaits, whichever `c_t` wants, earn -65 ± 4, a blind one searched for -187 ± 9 (64 episodes from seed 1000, none
+    failed).
 
     Args:
         delay: `l` of the paper, steps of .05 s; 0 rewards at once.
