@@ -56,6 +56,18 @@ def test_wishes_change_as_often_as_they_should_and_are_among_the_targets(name):
     assert len(set(flown(name, change=0.0)[0])) == 1 and len(set(flown(name, targets=[1.5], change=1.0)[0])) == 1
 
 
+def test_the_gale_told_is_the_force_on_the_torso_against_the_run():
+    env = environments.make("cheetah-gale-s", change=0.3).unwrapped
+    env.reset(seed=0)
+    torso, told = env.body.model.body("torso").id, []
+    for action in np.random.default_rng(0).uniform(-1, 1, (40, 6)):
+        _, reward, *_, info = env.step(action)
+        assert env.body.data.xfrc_applied[torso].tolist() == [-info["context"][0], 0, 0, 0, 0, 0]
+        assert reward == pytest.approx(-abs(info["x_velocity"] - 1.5) - 0.05 * action @ action)
+        told.append(info["context"][0])
+    assert set(told) == {-40.0, 15.0}
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_standing_still_fails_and_half_the_error_does_not(name):
     env = environments.make(name).unwrapped
@@ -70,6 +82,9 @@ def test_standing_still_fails_and_half_the_error_does_not(name):
 @pytest.mark.parametrize(
     ("name", "options"),
     [
+        ("cheetah-gale-s", {"winds": []}),
+        ("cheetah-gale-s", {"winds": [float("inf"), 1.0]}),
+        ("cheetah-gale-s", {"change": -0.1}),
         ("cheetah-delayed-s", {"delay": -1}),
         ("cheetah-delayed-s", {"delay": 1.5}),
         ("cheetah-delayed-s", {"targets": []}),

@@ -52,7 +52,6 @@ class LeggedTask(HiddenTask, MujocoEnv):
         _, info = super().reset(seed=seed, options=options)
         self._drawn = float(np.float32(self.np_random.uniform(*self._span)))  # to the last bit what `context` tells
         self._apply(self._drawn)
-        mujoco.mj_forward(self.model, self.data)
         return self._get_obs().astype(np.float32), {**info, "context": self.context}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
