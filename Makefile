@@ -58,6 +58,10 @@ reliability-tools: .venv-reliability/.ready
 	.venv-reliability/bin/pip install --quiet --disable-pip-version-check -r $<
 	touch $@
 
+.PHONY: worlds
+worlds: venv ## What experts earn in every environment, with and without sight of its context: make worlds WORLDS="--only blind cheetah-wind-s"
+	$(BIN)/python -m tests.worlds $(WORLDS)
+
 bench: ## Kernel, forward, act and training-step times of this machine.
 	RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 MALLOC_MMAP_THRESHOLD_=1073741824 MALLOC_TRIM_THRESHOLD_=4294967296 cargo bench --locked
 

@@ -15,7 +15,7 @@ from ada_diffuser import environments
 from ada_diffuser.collect import Job, collect
 from ada_diffuser.commands.collect import main
 from ada_diffuser.dataset import card_path, load_episodes
-from ada_diffuser.experts import formula_of
+from ada_diffuser.experts import formula_of, load_expert
 
 TINY = ["--episodes", "3", "--quiet", "--expert-searches", "1", "--expert-iterations", "1"]
 
@@ -52,7 +52,7 @@ def test_layout_is_d4rls(tmp_path):
 def test_rows_hold_the_step_as_it_was_executed():
     """Row t: the state before the step, the clipped noisy action, its reward, the wind that blew in it."""
     job = Job("point-wind-s", {"sigma": 0.0}, 2, (0.5,), seed=1)
-    episodes, failures = collect(job, formula_of(environments.PointWindS()))
+    episodes, failed = collect(job, formula_of(environments.PointWindS()))
     for start in (0, 200):
         rows = slice(start, start + 199)
         velocity = episodes.observations[rows, 2:]
@@ -64,7 +64,7 @@ def test_rows_hold_the_step_as_it_was_executed():
         assert np.allclose(episodes.rewards[rows], cost, atol=1e-5)
     assert np.abs(episodes.actions).max() == 1.0, "noise this large reaches the bounds, and what is stored is clipped"
     assert len(episodes.returns()) == 2 and episodes.returns().sum() == pytest.approx(episodes.rewards.sum(), rel=1e-4)
-    assert failures == int((episodes.returns() < -60).sum())
+    assert np.array_equal(failed, episodes.returns() < -60)
 
 
 def test_the_card_tells_what_the_file_is(tmp_path, capsys):
@@ -101,9 +101,58 @@ def test_a_given_expert_flies_instead(tmp_path):
     assert not (tmp_path / "y.expert.npz").exists()
 
 
+def test_a_share_is_flown_blind_and_the_file_and_the_card_say_which(tmp_path):
+    path = tmp_path / "x.h5"
+    flags = ["--env", "pendulum-torque-s", "--episodes", "9", "--action-noise", "0", "--blind", "0.33", "--seed", "4"]
+    assert run(path, *flags) == 0
+    episodes, card = load_episodes(path), json.loads(card_path(path).read_text())
+    flown_blind = episodes.blind.reshape(9, 200)
+    assert episodes.blind.dtype == np.bool_ and (flown_blind == flown_blind[:, :1]).all() and flown_blind[:, 0].sum() == 3
+    pilot = environments.PendulumTorqueS()
+    for blind, observation, action, torque in zip(episodes.blind, episodes.observations, episodes.actions, episodes.context, strict=True):
+        assert action == pytest.approx(pilot.expert_action(observation, np.zeros(1) if blind else torque), abs=1e-5)
+    returns, blind = episodes.returns(), card["blind"]
+    assert (blind["share"], blind["flown_blind"]["episodes"], blind["flown_seeing"]["episodes"]) == (0.33, 3, 6)
+    assert blind["flown_blind"]["returns"]["mean"] == pytest.approx(returns[flown_blind[:, 0]].mean(), abs=1e-3)
+    assert blind["flown_seeing"]["returns"]["mean"] == pytest.approx(returns[~flown_blind[:, 0]].mean(), abs=1e-3)
+    assert blind["expert"]["told"] == [0.0] and "told" not in card["expert"]
+
+    assert run(tmp_path / "again.h5", *flags) == 0
+    assert path.read_bytes() == (tmp_path / "again.h5").read_bytes()
+    assert run(tmp_path / "other.h5", *flags[:-1], "5") == 0
+    assert not np.array_equal(load_episodes(tmp_path / "other.h5").blind, episodes.blind)
+
+
+def test_without_blind_episodes_nothing_is_said_of_them(tmp_path):
+    assert run(tmp_path / "x.h5", "--env", "point-wind-s") == 0
+    assert run(tmp_path / "y.h5", "--env", "point-wind-s", "--blind", "0") == 0
+    assert (tmp_path / "x.h5").read_bytes() == (tmp_path / "y.h5").read_bytes()
+    with h5py.File(tmp_path / "x.h5") as file:
+        assert "blind" not in file["infos"]
+    assert "blind" not in json.loads(card_path(tmp_path / "x.h5").read_text())
+
+
+def test_a_blind_expert_is_searched_for_kept_and_used_again(tmp_path):
+    path, cache = tmp_path / "x.h5", tmp_path / "x.blind.npz"
+    assert run(path, "--env", "cheetah-vel-e", "--blind", "1") == 0
+    first = cache.stat().st_mtime_ns
+    card = json.loads(card_path(path).read_text())
+    assert card["blind"]["flown_seeing"] == {"episodes": 0, "returns": None} and card["blind"]["expert"]["recipe"]["targets"] == []
+    assert card["blind"]["expert"]["recipe"]["blind"] is True and load_expert(cache).sizes(1) == (17, 6)
+    assert run(path, "--env", "cheetah-vel-e", "--blind", "0.5", "--seed", "9") == 0
+    assert cache.stat().st_mtime_ns == first
+    given = ["--expert", str(tmp_path / "x.expert.npz"), "--blind-expert", str(cache)]
+    assert run(tmp_path / "y.h5", "--env", "cheetah-vel-e", "--blind", "0.5", "--seed", "9", *given) == 0
+    assert path.read_bytes() == (tmp_path / "y.h5").read_bytes() and not (tmp_path / "y.blind.npz").exists()
+
+
 @pytest.mark.parametrize(
     ("flags", "word"),
     [
+        (["--env", "point-wind-s", "--blind", "1.5"], "--blind"),
+        (["--env", "point-wind-s", "--blind", "nan"], "--blind"),
+        (["--env", "point-wind-s", "--blind-expert", "random"], "--blind"),
+        (["--env", "Pendulum-v1", "--expert", "random", "--blind", "0.5"], "--blind-expert"),
         (["--env", "cheetah-rain"], "cheetah-wind-s"),
         (["--env", "point-wind-s", "--episodes", "0"], "--episodes"),
         (["--env", "point-wind-s", "--option", "sigma"], "NAME=VALUE"),

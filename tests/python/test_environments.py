@@ -20,7 +20,9 @@ from ada_diffuser.commands.collect import main as collect
 from ada_diffuser.dataset import load_episodes
 from ada_diffuser.environments.half_cheetah import XML, HalfCheetahBody
 
-CHEETAHS = [name for name in environments.NAMES if name.startswith("cheetah")]
+CHEETAHS = [name for name in environments.NAMES if name.startswith("cheetah-wind") or name == "cheetah-vel-e"]
+FALLS = ("hopper-gravity-e", "walker-mass-e")
+"""Environments whose episodes a fall ends."""
 
 
 @pytest.mark.parametrize("name", environments.NAMES)
@@ -33,7 +35,7 @@ def test_passes_gymnasiums_own_checker(name):
         check_env(environments.make(name).unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("name", environments.NAMES)
+@pytest.mark.parametrize("name", sorted(set(environments.NAMES) - set(FALLS)))
 def test_truncates_after_200_steps_and_never_terminates(name):
     env = environments.make(name)
     env.reset(seed=0)
@@ -370,4 +372,4 @@ def test_a_return_of_standing_still_counts_as_failed_and_an_experts_does_not(nam
     env.reset(seed=0)
     still = sum(env.step(np.zeros(env.action_space.shape, np.float32))[1] for _ in range(200))
     assert env.failed(still)
-    assert not env.failed(-50.0)
+    assert not env.failed(900.0 if name in FALLS else -50.0)

@@ -94,10 +94,26 @@ def test_a_file_that_is_no_expert_is_named(tmp_path):
 
 
 def test_recipes_fit_their_environments():
-    def recipe(name, **options):
-        return recipe_for(environments.make(name, **options), options, 0, 2, TINY)
+    def recipe(name, *, blind=False, **options):
+        return recipe_for(environments.make(name, **options), options, 0, 2, 1, blind=blind)
 
     assert recipe("point-wind-s") is None
     assert recipe("cheetah-wind-s", gain=2.0).targets == ()
     assert recipe("cheetah-vel-e").targets == (1.0, 2.5)
     assert len(recipe("cheetah-vel-e", targets="uniform").targets) == 5
+    assert recipe("cheetah-gale-s").targets == (-40.0, 15.0)
+    for name in ("cheetah-wind-s", "cheetah-vel-e"):
+        blind, seeing = recipe(name, blind=True), recipe(name)
+        assert (blind.targets, blind.blind, seeing.blind) == ((), True, False)
+        assert blind.to_json()["blind"] is True and "blind" not in seeing.to_json(), "files of experts that see go on being theirs"
+
+
+def test_a_blind_formula_is_told_the_mean_context_and_one_without_has_none():
+    env = environments.make("pendulum-gravity-e", gravity=(5.0, 9.0))
+    blind = formula_of(env, blind=True)
+    observation = np.array([1.0, 0.1, 0.0])
+    assert np.array_equal(blind.act(observation, np.array([5.0])), env.unwrapped.expert_action(observation, np.array([7.0])))
+    assert blind.card["told"] == [7.0]
+    env.unwrapped.__class__ = type("Untold", (environments.PendulumGravityE,), {"mean_context": None})
+    with pytest.raises(ValueError, match="mean_context"):
+        formula_of(env, blind=True)

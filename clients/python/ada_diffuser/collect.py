@@ -26,6 +26,7 @@ class Job:
         noise: standard deviations of action noise; each episode draws one.
         seed: of the environment, the noise and the choice among `noise`.
         episode_steps: where episodes are truncated; None: where the environment is registered to be.
+        blind: share of the episodes, 0 to 1, that an expert flies which does not see the context; drawn by the seed.
     """
 
     env: str
@@ -34,25 +35,38 @@ class Job:
     noise: tuple[float, ...]
     seed: int
     episode_steps: int | None = None
+    blind: float = 0.0
+
+    def flown_blind(self) -> np.ndarray:
+        """Which episodes, (episodes,) bool: their number is the share's, rounded; which ones has its own stream of chance."""
+        flags = np.arange(self.episodes) < round(self.blind * self.episodes)
+        return np.random.default_rng([self.seed, 4]).permutation(flags)
 
 
-def collect(job: Job, expert: Expert, progress: Callable[[int], object] = lambda episodes: None) -> tuple[Episodes, int]:
-    """Fly the episodes of one session; returns them and how many failed. A pure function of its arguments.
+def collect(
+    job: Job, expert: Expert, progress: Callable[[int], object] = lambda episodes: None, *, blind: Expert | None = None
+) -> tuple[Episodes, np.ndarray]:
+    """Fly the episodes of one session; returns them and which of them failed, (episodes,) bool. A pure function of its arguments.
 
-    `progress` is called with the number of episodes just flown.
+    `progress` is called with the number of episodes just flown. `blind` flies the share that the job wants flown blind.
     """
+    flown_blind = job.flown_blind()
+    if blind is None and flown_blind.any():
+        raise ValueError("a job with a blind share needs a blind expert")
     env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
     env_seed, noise_seed = np.random.SeedSequence(job.seed).generate_state(2)
     rng = np.random.default_rng(noise_seed)
-    flown, failures = [], 0
-    for episode in range(job.episodes):
+    flown, failed = [], np.zeros(job.episodes, np.bool_)
+    for episode, is_blind in enumerate(flown_blind):
         std = float(rng.choice(job.noise))
-        flown.append(_fly(env, expert, std, rng, int(env_seed) if episode == 0 else None))
-        failures += environments.failed(env, float(flown[-1].rewards.sum()))
+        flown.append(_fly(env, blind if is_blind else expert, std, rng, int(env_seed) if episode == 0 else None))
+        failed[episode] = environments.failed(env, float(flown[-1].rewards.sum()))
+        if job.blind:
+            flown[-1].blind = np.full(len(flown[-1].rewards), is_blind)
         progress(1)
     env.close()
     columns = {name: [getattr(e, name) for e in flown] for name in Episodes.__dataclass_fields__}
-    return Episodes(**{name: None if parts[0] is None else np.concatenate(parts) for name, parts in columns.items()}), failures
+    return Episodes(**{name: None if parts[0] is None else np.concatenate(parts) for name, parts in columns.items()}), failed
 
 
 def _check_fit(env: gym.Env, expert: Expert) -> None:
@@ -94,24 +108,35 @@ def _fly(env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, see
     return Episodes(*arrays, context=told)
 
 
-def data_card(job: Job, expert: Expert, episodes: Episodes, failures: int) -> dict[str, Any]:
+def data_card(job: Job, expert: Expert, episodes: Episodes, failed: np.ndarray, blind: Expert | None = None) -> dict[str, Any]:
     """What the episodes are and how they came about, without the facts about their file."""
     returns = episodes.returns()
-    return {
+    card = {
         "format": "d4rl-hdf5",
         "environment": {"id": job.env, "options": job.options} | ({"episode_steps": job.episode_steps} if job.episode_steps else {}),
         "episodes": len(returns),
         "steps": len(episodes.rewards),
         "seed": job.seed,
         "action_noise": list(job.noise),
-        "returns": {
-            "mean": round(float(returns.mean()), 3),
-            "standard_error": round(float(returns.std(ddof=1) / np.sqrt(len(returns))), 3) if len(returns) > 1 else None,
-            "median": round(float(np.median(returns)), 3),
-            "min": round(float(returns.min()), 3),
-            "max": round(float(returns.max()), 3),
-            "failures": failures,
-        },
+        "returns": returns_summary(returns, failed),
         "expert": expert.card,
-        "versions": {name: version(name) for name in ("ada-diffuser", "gymnasium", "h5py", "mujoco", "numpy")},
+    }
+    if blind:
+        flown_blind = job.flown_blind()
+        card["blind"] = {"share": job.blind, "expert": blind.card}
+        for name, which in (("flown_blind", flown_blind), ("flown_seeing", ~flown_blind)):
+            summary = returns_summary(returns[which], failed[which]) if which.any() else None
+            card["blind"][name] = {"episodes": int(which.sum()), "returns": summary}
+    return card | {"versions": {name: version(name) for name in ("ada-diffuser", "gymnasium", "h5py", "mujoco", "numpy")}}
+
+
+def returns_summary(returns: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
+    """What a card says of the returns (episodes,) of at least one episode, and of which failed."""
+    return {
+        "mean": round(float(returns.mean()), 3),
+        "standard_error": round(float(returns.std(ddof=1) / np.sqrt(len(returns))), 3) if len(returns) > 1 else None,
+        "median": round(float(np.median(returns)), 3),
+        "min": round(float(returns.min()), 3),
+        "max": round(float(returns.max()), 3),
+        "failures": int(failed.sum()),
     }

@@ -25,6 +25,7 @@ class Episodes:
         timeouts: (N,), bool; the clock ended the episode in this step.
         action_noise: (N,), float32; standard deviation of the episode's action noise.
         context: (N, context), float32; what was hidden while the action was executed; None where the environment tells none.
+        blind: (N,), bool; whether the episode was flown without sight of the context; None where none was meant to be.
     """
 
     observations: np.ndarray
@@ -34,6 +35,7 @@ class Episodes:
     timeouts: np.ndarray
     action_noise: np.ndarray
     context: np.ndarray | None = None
+    blind: np.ndarray | None = None
 
     def returns(self) -> np.ndarray:
         """Undiscounted return of each episode, shape (episodes,), float64."""
@@ -55,8 +57,10 @@ _PATHS = {
     "timeouts": "timeouts",
     "context": "infos/context",
     "action_noise": "infos/action_noise",
+    "blind": "infos/blind",
 }
 """Field of `Episodes` -> path in the file, in the order of writing."""
+_OPTIONAL = ("context", "blind")
 
 
 def save_episodes(episodes: Episodes, path: Path) -> str:
@@ -73,7 +77,7 @@ def save_episodes(episodes: Episodes, path: Path) -> str:
 def load_episodes(path: Path) -> Episodes:
     """Read what `save_episodes` wrote. Raises `KeyError` naming a missing column."""
     with h5py.File(path, "r") as file:
-        present = {name: path for name, path in _PATHS.items() if name != "context" or path in file}
+        present = {name: path for name, path in _PATHS.items() if name not in _OPTIONAL or path in file}
         return Episodes(**{name: file[path][()] for name, path in present.items()})
 
 

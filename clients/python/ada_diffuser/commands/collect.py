@@ -7,7 +7,6 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from ada_diffuser.commands.progress import progress
 
 if TYPE_CHECKING:
     from ada_diffuser.collect import Job
-    from ada_diffuser.experts import Expert, ExpertRecipe
+    from ada_diffuser.experts import Expert, ExpertRecipe, PolicyBank
 
 _ABOUT = """\
 Let an expert that sees the hidden context fly an environment, and write the episodes as a D4RL-layout HDF5 file:
@@ -30,7 +29,11 @@ are searched for here (Augmented Random Search, linear policies; for the cheetah
 time) and kept beside the data as X.expert.npz; a later call with the same environment, options, and expert settings uses that
 file again. An environment that says nothing of it needs --expert: a function of yours that takes the observation and the
 context, which is None unless the environment has an attribute `context`, or random actions. The same arguments give the same
-bytes."""
+bytes.
+
+--blind S has a share S of the episodes, drawn by the seed, flown by an expert that does not see the context: policies searched
+for without it and kept as X.blind.npz, or the formula with the context's mean, where the class says what that is (`mean_context`).
+infos/blind tells those episodes, the card has the returns of both kinds."""
 
 _EXAMPLES = """\
 examples:
@@ -39,6 +42,7 @@ examples:
   ada-collect --env cheetah-wind-s --option gain=2 --episodes 300 --out data/strong-wind.h5
   ada-collect --env cheetah-vel-e --option 'targets=[0.5, 1.5, 2.5]' --out data/three-speeds.h5
   ada-collect --env cheetah-wind-s --expert data/cheetah-wind-s.expert.npz --seed 7 --out data/more.h5
+  ada-collect --env hopper-gravity-e --blind 0.5 --action-noise 0.1,0.2 --out data/mixed.h5
   ada-collect --env my_module:Mine-v0 --expert my_module:policy --out data/mine.h5
 """
 
@@ -53,14 +57,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace, command: str) -> None:
     """Plan, expert, episodes, files; then the data card, or what matters of it."""
     _check_arguments(args)
-    job, recipe = _plan(args)
+    job = _plan(args)
     from ada_diffuser.collect import collect, data_card
     from ada_diffuser.dataset import save_card, save_episodes
 
-    expert = _expert(args, job, recipe)
+    expert = _expert(args, job, blind=False)
+    blind = _expert(args, job, blind=True) if job.blind else None
     with progress(job.episodes, "episodes", "episode", quiet=args.quiet) as advance:
-        episodes, failures = collect(job, expert, advance)
-    card = data_card(job, expert, episodes, failures)
+        episodes, failed = collect(job, expert, advance, blind=blind)
+    card = data_card(job, expert, episodes, failed, blind)
     card["file"] = {"name": args.out.name, "sha256": save_episodes(episodes, args.out), "bytes": args.out.stat().st_size}
     card["command"] = command
     save_card(card, args.out)
@@ -85,6 +90,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     expert = parser.add_argument_group("expert")
     expert.add_argument("--expert", metavar="E", help="fly this one: X.npz, MODULE:FUNCTION (of observation and context), or random")
+    expert.add_argument(
+        "--blind", type=float, default=0.0, metavar="SHARE", help="share of the episodes flown without sight of the context (default 0)"
+    )
+    expert.add_argument("--blind-expert", metavar="E", help="fly this one there; as --expert")
     expert.add_argument("--expert-seed", type=int, default=0, metavar="N", help="of the searches (default 0)")
     expert.add_argument(
         "--expert-searches", type=int, metavar="N", help="searches for each policy (default: as the environment's class says, 3)"
@@ -102,23 +111,23 @@ def _check_arguments(args: argparse.Namespace) -> None:
         value = getattr(args, flag)
         if value is not None and value < least:
             raise ValueError(f"--{flag.replace('_', '-')} must be at least {least}")
+    if not 0.0 <= args.blind <= 1.0:
+        raise ValueError(f"--blind must be a share, 0 to 1, not {args.blind:g}")
+    if args.blind_expert and not args.blind:
+        raise ValueError("--blind-expert flies no episode without --blind")
     check_output("--out", args.out, ".h5", ".hdf5")
 
 
-def _plan(args: argparse.Namespace) -> tuple[Job, ExpertRecipe | None]:
-    """What to fly and, where the expert is to be searched for, how. Raises `ValueError` naming the argument that is wrong."""
+def _plan(args: argparse.Namespace) -> Job:
+    """What to fly. Raises `ValueError` naming the argument that is wrong, before anything is searched for."""
     environments = import_environments()
     from ada_diffuser.collect import Job
-    from ada_diffuser.experts import recipe_for
 
     options = {name: _value(text) for name, text in parse_settings(args.option).items()}
     env = environments.make(args.env, episode_steps=args.episode_steps, **options)
     noise = _noise(args.action_noise) if args.action_noise else environments.action_noise(env)
-    recipe = None if args.expert else recipe_for(env, options, args.expert_seed, args.expert_searches)
-    if recipe and args.expert_iterations:
-        recipe = replace(recipe, ars=replace(recipe.ars, iterations=args.expert_iterations))
     env_id = args.env if ":" in args.env else env.spec.id
-    return Job(env_id, options, args.episodes, noise, args.seed, args.episode_steps), recipe
+    return Job(env_id, options, args.episodes, noise, args.seed, args.episode_steps, args.blind)
 
 
 def _value(text: str) -> Any:
@@ -139,29 +148,27 @@ def _noise(text: str) -> tuple[float, ...]:
     return levels
 
 
-def _expert(args: argparse.Namespace, job: Job, recipe: ExpertRecipe | None) -> Expert:
+def _expert(args: argparse.Namespace, job: Job, *, blind: bool) -> Expert:
     """The one given, the formula, the file beside the output if its recipe is this one, or a new search."""
     from ada_diffuser import environments
-    from ada_diffuser.experts import formula_of, import_expert, load_expert, make_expert, random_expert, save_expert
+    from ada_diffuser.experts import formula_of, import_expert, kept_expert, load_expert, make_expert, random_expert, recipe_for
 
     env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
-    if args.expert == "random":
+    given = args.blind_expert if blind else args.expert
+    if given == "random":
         return random_expert(env.action_space.low, env.action_space.high, job.seed)
-    if args.expert:
-        return import_expert(args.expert) if _is_function(args.expert) else load_expert(Path(args.expert))
-    if formula := formula_of(env):
+    if given:
+        return import_expert(given) if _is_function(given) else load_expert(Path(given))
+    if formula := formula_of(env, blind=blind):
         return formula
-    assert recipe
-    cache = args.out.with_name(f"{args.out.stem}.expert.npz")
-    if cache.exists():
-        expert = load_expert(cache)
-        if expert.card.get("recipe") == json.loads(json.dumps(recipe.to_json())):
-            return expert
-        print(f"{cache} has another recipe; training anew", file=sys.stderr)
-    with progress(recipe.iterations, "expert", "iteration", quiet=args.quiet) as advance:
-        expert = make_expert(recipe, advance)
-    save_expert(expert, cache)
-    return expert
+    recipe = recipe_for(env, job.options, args.expert_seed, args.expert_searches, args.expert_iterations, blind=blind)
+    word = "blind" if blind else "expert"
+
+    def search(recipe: ExpertRecipe) -> PolicyBank:
+        with progress(recipe.iterations, word, "iteration", quiet=args.quiet) as advance:
+            return make_expert(recipe, advance)
+
+    return kept_expert(recipe, args.out.with_name(f"{args.out.stem}.{word}.npz"), search)
 
 
 def _is_function(text: str) -> bool:

@@ -16,6 +16,8 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
+from .cheetah_switching import CheetahCumulativeS, CheetahDelayedS, CheetahGaleS
+from .legged import HopperGravityE, WalkerMassE
 from .pendulum import PendulumGravityE
 from .pendulum_torque import PendulumTorqueS
 from .point_wind import PointWindS
@@ -25,14 +27,19 @@ from .task import NAMES, HiddenTask
 __all__ = [
     "NAMES",
     "ArsSettings",
+    "CheetahCumulativeS",
+    "CheetahDelayedS",
+    "CheetahGaleS",
     "CheetahVelE",
     "CheetahWindE",
     "CheetahWindS",
     "HiddenTask",
+    "HopperGravityE",
     "PendulumGravityE",
     "PendulumTorqueS",
     "PointWindS",
     "Search",
+    "WalkerMassE",
     "action_noise",
     "failed",
     "make",

@@ -40,6 +40,9 @@ class HalfCheetahBody:
         self.model = _load_model()
         self.data = mujoco.MjData(self.model)
         self.dt = self.model.opt.timestep * FRAME_SKIP
+        # MuJoCo's bindings make a new view of their arrays at each look, and a search looks millions of times.
+        self._position, self._velocity, self._control = self.data.qpos, self.data.qvel, self.data.ctrl
+        self._forces = self.data.xfrc_applied
         self._rest = self.data.qpos.copy()
         self._torso = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, "torso")
         self._rootx = self.model.joint("rootx").dofadr[0]
@@ -59,25 +62,25 @@ class HalfCheetahBody:
         moves nothing in a planar body.)
         """
         if self.wind_on == "torso":
-            self.data.xfrc_applied[self._torso, 0] = -force
+            self._forces[self._torso, 0] = -force
         elif self.wind_on == "all_bodies":
-            self.data.xfrc_applied[self._torso :, 0] = -force
+            self._forces[self._torso :, 0] = -force
         else:
             self.data.qfrc_applied[self._rootx] = -force
 
     def step(self, action: np.ndarray, wind: float) -> float:
         """Execute `action` (6,) for .05 s against `wind` N; returns the mean forward speed in m/s."""
-        before = self.data.qpos[0]
-        self.data.ctrl[:] = action
+        before = self.x
+        self._control[:] = action
         self.blow(wind)
         mujoco.mj_step(self.model, self.data, nstep=FRAME_SKIP)
-        return float((self.data.qpos[0] - before) / self.dt)
+        return (self.x - before) / self.dt
 
     def observation(self) -> np.ndarray:
         """Positions without x, then velocities, shape (17,), float32."""
-        return np.concatenate([self.data.qpos[1:], self.data.qvel]).astype(np.float32)
+        return np.concatenate([self._position[1:], self._velocity]).astype(np.float32)
 
     @property
     def x(self) -> float:
         """Distance from the start, m."""
-        return float(self.data.qpos[0])
+        return float(self._position[0])

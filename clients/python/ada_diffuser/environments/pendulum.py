@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 
-from .task import HiddenTask
+from .task import HiddenTask, checked_range
 
 GRAVITY = (4.0, 16.0)
 """Least and largest gravity, m/s^2; the mean is Pendulum-v1's."""
@@ -49,10 +49,8 @@ class PendulumGravityE(HiddenTask, PendulumEnv, name="pendulum-gravity-e", id="a
     def __init__(self, gravity: Sequence[float] = GRAVITY, render_mode: str | None = None) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be rgb_array or None, not {render_mode!r}")
-        if len(gravity) != 2 or not 0 < gravity[0] <= gravity[1] < math.inf:
-            raise ValueError(f"gravity must be two numbers, 0 < least <= largest, not {gravity!r}")
+        self.gravity = checked_range("gravity", gravity)
         super().__init__(render_mode)
-        self.gravity = float(gravity[0]), float(gravity[1])
 
     @property
     def context(self) -> np.ndarray:
@@ -82,6 +80,11 @@ class PendulumGravityE(HiddenTask, PendulumEnv, name="pendulum-gravity-e", id="a
             return np.clip([balance], -self.max_torque, self.max_torque)
         energy = omega**2 / 2 - 1.5 * gravity * (1 - cosine)
         return math.copysign(1.0, omega) * np.clip([-energy], -self.max_torque, self.max_torque)
+
+    @property
+    def mean_context(self) -> np.ndarray:
+        """The middle of the range."""
+        return np.array([sum(self.gravity) / 2], np.float32)
 
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode earned what it does where a pilot with the wrong gravity never gets upright."""

@@ -91,6 +91,11 @@ class PendulumTorqueS(HiddenTask, PendulumEnv, name="pendulum-torque-s", id="ada
         pump = math.copysign(1.0, omega) * np.clip([-energy], -self.max_torque, self.max_torque)
         return np.clip(pump - against, -self.max_torque, self.max_torque)
 
+    @property
+    def mean_context(self) -> np.ndarray:
+        """No torque: it turns both ways alike."""
+        return np.zeros(1, np.float32)
+
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode earned what it does where the rod is not held."""
         return episode_return < FAILED_RETURN

@@ -99,6 +99,11 @@ class PointWindS(HiddenTask, name="point-wind-s", id="ada/PointWind-S-v0"):
         """clip((-3 p - 2.5 v - w_t u) / 4)"""
         return (-3.0 * observation[:2] - 2.5 * observation[2:] - context) / 4.0
 
+    @property
+    def mean_context(self) -> np.ndarray:
+        """No wind: it may come from anywhere."""
+        return np.zeros(2, np.float32)
+
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode did worse than a pilot that ignores how the wind changes."""
         return episode_return < FAILED_RETURN

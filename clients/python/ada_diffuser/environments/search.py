@@ -35,9 +35,11 @@ class Search:
         holds: option of the environment that takes a tuple of contexts to draw from: each of the `search_targets` is searched
             for with that one alone. Empty where one policy reads the context.
         varies: option that is also an attribute -> share by which an episode of practice changes it at most, up or down.
+        practice: attribute -> its value in practice, where that is another than the one the policies are judged by.
     """
 
     searches: int = 3
     ars: ArsSettings = field(default_factory=ArsSettings)
     holds: str = ""
     varies: Mapping[str, float] = field(default_factory=dict)
+    practice: Mapping[str, float] = field(default_factory=dict)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -50,6 +51,11 @@ class HiddenTask(gym.Env[np.ndarray, np.ndarray]):
         raise NotImplementedError
 
     @property
+    def mean_context(self) -> np.ndarray | None:
+        """What a blind expert that is a formula takes the context for, in every episode; None: there is no blind expert."""
+        return None
+
+    @property
     def search_targets(self) -> tuple[float, ...]:
         """Contexts that get a policy of their own in a search, with `Search.holds`; empty: one policy reads the context."""
         return ()
@@ -57,3 +63,10 @@ class HiddenTask(gym.Env[np.ndarray, np.ndarray]):
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode counts as failed."""
         return False
+
+
+def checked_range(option: str, values: Sequence[float]) -> tuple[float, float]:
+    """The option of a constructor that says between which two numbers a context is drawn. Raises `ValueError` naming it."""
+    if len(values) != 2 or not 0 < values[0] <= values[1] < math.inf:
+        raise ValueError(f"{option} must be two numbers, 0 < least <= largest, not {values!r}")
+    return float(values[0]), float(values[1])

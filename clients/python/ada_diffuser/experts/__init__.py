@@ -1,5 +1,6 @@
 """Experts that see the hidden context, made on the spot: the environment's own formula, or a search as it wants one."""
 
+from .kept import kept_expert
 from .policy import (
     CalledExpert,
     Expert,
@@ -20,6 +21,7 @@ __all__ = [
     "PolicyBank",
     "formula_of",
     "import_expert",
+    "kept_expert",
     "load_expert",
     "make_expert",
     "random_expert",

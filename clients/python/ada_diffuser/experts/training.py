@@ -7,7 +7,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
@@ -34,9 +34,10 @@ class ExpertRecipe:
         options: keyword arguments of the environment.
         seed: of all searches.
         seeds: independent searches for each policy.
-        targets: contexts that get a policy each; empty where one policy reads the context.
+        targets: contexts that get a policy each; empty where one policy reads the context, or is blind.
         judge_noise: standard deviations of the action noise the iterates are judged under, as the data will have.
         ars: constants of the search.
+        blind: search one policy that does not see the context, in whatever contexts the environment draws.
     """
 
     env: str
@@ -46,6 +47,7 @@ class ExpertRecipe:
     targets: tuple[float, ...] = ()
     judge_noise: tuple[float, ...] = (0.0, 0.05, 0.1)
     ars: ArsSettings = field(default_factory=ArsSettings)
+    blind: bool = False
 
     @property
     def iterations(self) -> int:
@@ -54,24 +56,35 @@ class ExpertRecipe:
 
     def to_json(self) -> dict[str, Any]:
         """The recipe as plain JSON values."""
-        return {**asdict(self), "targets": list(self.targets), "judge_noise": list(self.judge_noise)}
+        plain = {**asdict(self), "targets": list(self.targets), "judge_noise": list(self.judge_noise)}
+        if not self.blind:
+            del plain["blind"]  # experts that see are as old as this package, and their files go on being theirs
+        return plain
 
 
-def formula_of(env: gym.Env) -> CalledExpert | None:
-    """The expert that the environment's class has as a method, with the options of `env`; None where there is none."""
+def formula_of(env: gym.Env, *, blind: bool = False) -> CalledExpert | None:
+    """The expert that the environment's class has as a method, with the options of `env`; None where there is none.
+
+    A blind one is told the environment's `mean_context`, whatever the context is. Raises `ValueError` where it has none.
+    """
     act = getattr(env.unwrapped, "expert_action", None)
     if not callable(act):
         return None
-    law = inspect.cleandoc(act.__doc__ or "").partition("\n")[0]
-    return CalledExpert(act, {"kind": "analytic", "law": law})
+    card = {"kind": "analytic", "law": inspect.cleandoc(act.__doc__ or "").partition("\n")[0]}
+    if not blind:
+        return CalledExpert(act, card)
+    mean = getattr(env.unwrapped, "mean_context", None)
+    if mean is None:
+        raise ValueError(f"{env.spec.id} has no mean_context, which its formula could take for the one that a blind expert does not see")
+    return CalledExpert(lambda observation, context: act(observation, mean), {**card, "told": mean.tolist()})
 
 
 def recipe_for(
-    env: gym.Env, options: dict[str, Any], seed: int, seeds: int | None = None, ars: ArsSettings | None = None
+    env: gym.Env, options: dict[str, Any], seed: int, seeds: int | None = None, iterations: int | None = None, *, blind: bool = False
 ) -> ExpertRecipe | None:
     """The recipe of an environment's expert as its class wants it searched for, or None where the expert is a formula.
 
-    `seeds` and `ars` take the place of the class's own. Raises `ValueError` for an environment that has neither.
+    `seeds` and `iterations` take the place of the class's own. Raises `ValueError` for an environment that has neither.
     """
     if formula_of(env):
         return None
@@ -79,12 +92,15 @@ def recipe_for(
     env_id, module = env.spec.id, type(task).__module__
     how, targets = getattr(task, "search", None), getattr(task, "search_targets", ())
     if not isinstance(how, Search):
-        raise ValueError(f"{env_id} has no expert of its own; give one: --expert MODULE:FUNCTION, --expert FILE.npz, or --expert random")
+        flag = "--blind-expert" if blind else "--expert"
+        raise ValueError(f"{env_id} has no expert of its own; give one: {flag} MODULE:FUNCTION, {flag} FILE.npz, or {flag} random")
     if targets and not how.holds:
         raise ValueError(f"{env_id} has search_targets, but its search does not say which option holds one of them")
     if not module.startswith(environments.__name__):
         env_id = f"{module}:{env_id}"  # the processes that search must import it, too
-    return ExpertRecipe(env_id, options, seed, seeds or how.searches, targets, environments.action_noise(env), ars or how.ars)
+    noise = environments.action_noise(env)
+    ars = replace(how.ars, iterations=iterations or how.ars.iterations)
+    return ExpertRecipe(env_id, options, seed, seeds or how.searches, () if blind else targets, noise, ars, blind)
 
 
 def make_expert(recipe: ExpertRecipe, progress: Callable[[int], object] = lambda iterations: None) -> PolicyBank:
@@ -96,7 +112,8 @@ def make_expert(recipe: ExpertRecipe, progress: Callable[[int], object] = lambda
     found = _run_searches(recipe, progress)
     slots = [found[i : i + recipe.seeds] for i in range(0, len(found), recipe.seeds)]
     best = [max(slot, key=lambda result: result[1]["fresh"]["mean"]) for slot in slots]
-    targets = np.array(recipe.targets) if recipe.targets else None
+    # The one policy of a blind bank is the nearest to every context, and reads none.
+    targets = np.array(recipe.targets or (0.0,)) if recipe.targets or recipe.blind else None
     card = {
         "kind": "ars",
         "recipe": recipe.to_json(),
@@ -146,7 +163,8 @@ class _Course:
             env = environments.make(recipe.env, **{**recipe.options, how.holds: (recipe.targets[slot],)})
         self.env, self.steps = env.unwrapped, environments.steps_max(env)
         self.varied = {name: (getattr(self.env, name), share) for name, share in how.varies.items()}
-        self.sees_context = not recipe.targets
+        self.practice = {name: (getattr(self.env, name), value) for name, value in how.practice.items()}
+        self.sees_context = not (recipe.targets or recipe.blind)
         self.env.reset(seed=0)  # what a class draws there need not be there earlier
         context_size = len(self.env.context) if self.sees_context else 0
         self.shape = (self.env.action_space.shape[0], self.env.observation_space.shape[0] + context_size)
@@ -156,21 +174,28 @@ class _Course:
         rng = np.random.default_rng([seed, 2])
         for name, (value, share) in self.varied.items():
             setattr(self.env, name, value * rng.uniform(1.0 - share, 1.0 + share))
+        for name, (_, value) in self.practice.items():
+            setattr(self.env, name, value)
         return self._play(policy, seed, 0.0)
 
-    def judge(self, policy: LinearPolicy, seeds: np.ndarray, noises: tuple[float, ...]) -> np.ndarray:
-        """Returns (episodes,) in the environment as it is, under each action noise in turn."""
-        for name, (value, _) in self.varied.items():
+    def judge(self, policy: LinearPolicy, seeds: np.ndarray, noises: tuple[float, ...]) -> tuple[np.ndarray, int]:
+        """Returns (episodes,) in the environment as it is, under each action noise in turn; and how many failed."""
+        for name, (value, _) in (self.varied | self.practice).items():
             setattr(self.env, name, value)
-        return np.array([self._play(policy, int(seed), noises[i % len(noises)])[0] for i, seed in enumerate(seeds)])
+        returns, failures = np.empty(len(seeds)), 0
+        for i, seed in enumerate(seeds):
+            returns[i], _ = self._play(policy, int(seed), noises[i % len(noises)])
+            failures += environments.failed(self.env, float(returns[i]))
+        return returns, failures
 
-    def summary(self, returns: np.ndarray) -> dict[str, Any]:
-        """What a card says of some episodes."""
+    def summary(self, policy: LinearPolicy, seeds: np.ndarray, noises: tuple[float, ...]) -> dict[str, Any]:
+        """What a card says of episodes that are judged."""
+        returns, failures = self.judge(policy, seeds, noises)
         return {
             "episodes": len(returns),
             "mean": round(float(returns.mean()), 3),
             "median": round(float(np.median(returns)), 3),
-            "failures": int(sum(environments.failed(self.env, r) for r in returns)),
+            "failures": failures,
         }
 
     def _play(self, policy: LinearPolicy, seed: int, noise: float) -> tuple[float, np.ndarray]:
@@ -183,9 +208,11 @@ class _Course:
             action = policy.act(features)
             if noise:
                 action = action + noise * rng.standard_normal(action.shape)
-            observation, reward, *_ = self.env.step(action)
+            observation, reward, terminated, *_ = self.env.step(action)
             visited.append(features)
             total += reward
+            if terminated:
+                break
         return total, np.array(visited, np.float64)
 
 
@@ -200,7 +227,7 @@ def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> tuple[LinearPol
             _iterations_done.value += 1
         if iteration % JUDGE_EVERY and iteration != recipe.ars.iterations:
             continue
-        score = float(course.judge(policy, judge_seeds, recipe.judge_noise).mean())
+        score = float(course.judge(policy, judge_seeds, recipe.judge_noise)[0].mean())
         if score > best_score:
             best, best_score, best_iteration = policy, score, iteration
     if best is None:
@@ -211,7 +238,7 @@ def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> tuple[LinearPol
         "search": number,
         "iteration": best_iteration,
         "judged": round(best_score, 3),
-        "fresh": course.summary(course.judge(best, fresh_seeds, recipe.judge_noise)),
-        "fresh_without_noise": course.summary(course.judge(best, fresh_seeds, (0.0,))),
+        "fresh": course.summary(best, fresh_seeds, recipe.judge_noise),
+        "fresh_without_noise": course.summary(best, fresh_seeds, (0.0,)),
     }
     return best, record
