@@ -38,7 +38,7 @@ impl Probed {
 /// If the data have no context, or a tensor operation fails.
 pub fn probe(task: &Task, latent: &LatentModel) -> Result<Probed> {
     let subjects = Subjects { train: &task.split.train, held_out: &task.split.held_out, rows_max: ROWS };
-    let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.looks(), &[0])?[0].error) };
+    let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.looks(), &[0])?[0].errors.whole) };
     let successor_state = probed(latent).contains(&Evidence::SuccessorState).then(|| error(Evidence::SuccessorState)).transpose()?;
     Ok(Probed { filter: error(Evidence::Filter)?, successor_state })
 }

@@ -1,5 +1,7 @@
 //! Ridge regression in f64: the measuring stick of the probe.
 
+use std::ops::Range;
+
 /// Row-major numbers, `width` columns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Table {
@@ -33,6 +35,12 @@ impl Table {
     /// The rows at these indices.
     pub fn select(&self, rows: &[usize]) -> Self {
         Self { width: self.width, values: rows.iter().flat_map(|row| self.row(*row)).copied().collect() }
+    }
+
+    /// Some of the columns of all rows.
+    pub fn columns(&self, columns: Range<usize>) -> Self {
+        let rows = self.values.chunks(self.width.max(1));
+        Self { width: columns.len(), values: rows.flat_map(|row| &row[columns.clone()]).copied().collect() }
     }
 
     fn moments(&self) -> (Vec<f64>, Vec<f64>) {
@@ -79,6 +87,11 @@ impl Ridge {
         (0..width).for_each(|i| gram[i * width + i] += lambda);
         solve(&mut gram, &mut cross, width, outputs);
         Self { mean, scale, offset, weights: cross }
+    }
+
+    /// What is predicted where nothing is known: the targets' mean.
+    pub fn offset(&self) -> &[f64] {
+        &self.offset
     }
 
     /// Predictions `(rows, targets)`.
