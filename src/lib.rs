@@ -50,6 +50,7 @@
 //! | what is known of the present and the future when it is | [`model::latent::Evidence`] |
 //! | a second window for an act (candidates, classifier-free guidance) | [`model::agent::Act::rows`], `model/agent/rows.rs` |
 //! | a layer: its shape, forward and backward | [`model::nn`], `op.rs` and one file a layer; loops in `kernels` |
+//! | what the latent found of the context, and what there was to find | [`train::probe`], `docs/identification.md` |
 //! | what is minimized, and which networks move | [`train::recipe::stages`], [`train::recipe::losses`] |
 //! | a batch cut from episodes | [`train::dataset::window`] |
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |

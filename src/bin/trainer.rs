@@ -5,6 +5,7 @@ use ada_diffuser::train::{
     dataset::room::Room,
     flags::{Cli, Inspect, Probe, Run},
     parallel,
+    probe::{self, Question},
     recipe::Recipe,
     report,
 };
@@ -107,9 +108,12 @@ fn print(text: &str) -> Result<ExitCode> {
 
 fn probe(flags: &Probe) -> Result<ExitCode> {
     let room = Room::new(flags.data_memory_mib, std::env::temp_dir());
-    let (scores, notes) = report::probe(&flags.checkpoint, &flags.data, &room)?;
-    notes.iter().for_each(|note| eprintln!("{note}"));
-    print(&if flags.json { serde_json::to_string_pretty(&scores)? } else { report::probe_table(&scores) })
+    let Probe { checkpoint, data, ahead, own_rollouts, .. } = flags;
+    let (environment, method) = (flags.environment.as_deref(), flags.method.as_deref());
+    let question = Question { checkpoint, data, ahead: usize::from(*ahead), own_rollouts: *own_rollouts, environment, method };
+    let answer = probe::probe(&question, &room)?;
+    answer.notes.iter().for_each(|note| eprintln!("{note}"));
+    print(&if flags.json { answer.json()? } else { answer.table() })
 }
 
 fn inspect(flags: &Inspect) -> Result<ExitCode> {

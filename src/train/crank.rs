@@ -2,7 +2,7 @@
 
 use super::{
     Outcome, TRAINING_DIR, Task, gate,
-    judgement::sentence,
+    judgement::{Found, sentence},
     learner::Learner,
     log::Log,
     losses::{Objective, context_free::measure_surprises},
@@ -144,9 +144,10 @@ impl Crank<'_> {
         let Some(latent) = learner.networks.latent.as_ref().filter(|_| stage.identifies()) else { return Ok(true) };
         let held_out = Objective::new(task, learner.position.stage).held_out(&learner.networks)?;
         let tells = task.split.train[0].context_dim > 0;
-        let probe = tells.then(|| gate::probe(task, latent)).transpose()?;
-        self.log.say(&sentence(&held_out, latent.baseline.is_some(), probe.as_ref()));
-        let Some(result) = probe else { return Ok(true) };
+        let context = tells.then(|| -> Result<_> { Ok((gate::probe(task, latent)?, gate::held_by_tokens(task)?)) }).transpose()?;
+        let beside_baseline = latent.baseline.is_some();
+        self.log.say(&sentence(&Found { held_out: &held_out, beside_baseline, looks: task.looks(), context }));
+        let Some((result, _)) = context else { return Ok(true) };
         let successor_state = result.successor_state.map(|error| ("probe_successor_state", error));
         let probed: Vec<_> = [("probe_filter", result.filter)].into_iter().chain(successor_state).collect();
         self.log.write(&learner.position, &probed)?;

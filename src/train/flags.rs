@@ -24,6 +24,19 @@ pub enum Cli {
     /// data set may have moved; other keys are refused by name. Log and TensorBoard files are in OUT/training.
     Run(Run),
     /// How well a checkpoint's latent knows the hidden context that a data set tells (infos/context)
+    ///
+    /// Errors are 1 - R2 of a linear map from the latent's mean to the context, on held-out episodes: 0 is exactly, 1 not at all.
+    ///
+    ///   filter     what a decision has: the tokens before t, and s_t
+    ///   successor  also a_t, r_t and what they led to
+    ///   prior      the filter's latent rolled out by the prior (--ahead)
+    ///   shift      the estimate at t is held against the context at t + shift
+    ///   ceiling    what the raw tokens hold, by ridge regression, with actions and without any: an expert's tell the context that it
+    ///              sees (but a push that is not known also hides what the context did)
+    ///
+    /// Beside the whole stand ages, in steps since the episode began. docs/identification.md says what can be found in principle, and
+    /// what to do where little is.
+    #[command(verbatim_doc_comment)]
     Probe(Probe),
     /// Check a checkpoint and say what it is: what is in force (sampler, restart, what was trained), origin, recipe, measurements
     Inspect(Inspect),
@@ -67,10 +80,22 @@ pub struct Probe {
     pub checkpoint: PathBuf,
     /// HDF5 file with infos/context
     pub data: PathBuf,
+    /// Roll the prior out so many steps beyond the coming one, and hold each against the context of its own step
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u16).range(..=100))]
+    pub ahead: u16,
+    /// The data are rollouts of the agent itself, whose own actions are no evidence; the rows of --json then say so
+    #[arg(long)]
+    pub own_rollouts: bool,
+    /// Name of the environment in the rows of --json [default: the data set's file name]
+    #[arg(long)]
+    pub environment: Option<String>,
+    /// Name of the method in the rows of --json [default: the recipe's name]
+    #[arg(long)]
+    pub method: Option<String>,
     /// Keep the rows of the data set in a temporary file (in TMPDIR) if they take more than this [default: half of the memory that is free]
     #[arg(long, value_name = "MIB")]
     pub data_memory_mib: Option<u64>,
-    /// Print JSON instead of a table
+    /// Print rows of report/identification.json instead of a table
     #[arg(long)]
     pub json: bool,
 }

@@ -5,7 +5,7 @@
 
 use super::{
     Task,
-    probe::{Subjects, latent_probe, places, probed},
+    probe::{Held, Subjects, held, latent_probe, places, probed},
     recipe::stages::Gate,
     ridge::Table,
 };
@@ -37,10 +37,22 @@ impl Probed {
 /// # Errors
 /// If the data have no context, or a tensor operation fails.
 pub fn probe(task: &Task, latent: &LatentModel) -> Result<Probed> {
-    let subjects = Subjects { train: &task.split.train, held_out: &task.split.held_out, rows_max: ROWS };
-    let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.looks(), &[0])?[0].error) };
+    let subjects = subjects(task);
+    let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.looks(), &[0])?[0].errors.whole) };
     let successor_state = probed(latent).contains(&Evidence::SuccessorState).then(|| error(Evidence::SuccessorState)).transpose()?;
     Ok(Probed { filter: error(Evidence::Filter)?, successor_state })
+}
+
+/// What there is to find for a model that looks back so far: the raw tokens' own errors at the probe's places.
+///
+/// # Errors
+/// If an episode cannot be read.
+pub fn held_by_tokens(task: &Task) -> Result<Held> {
+    Ok(held(&subjects(task), task.looks())?)
+}
+
+fn subjects(task: &Task) -> Subjects<'_> {
+    Subjects { train: &task.split.train, held_out: &task.split.held_out, rows_max: ROWS }
 }
 
 /// Whether the contexts that the gate holds the latent against differ at all: an error in units of their variance needs one.

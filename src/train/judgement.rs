@@ -1,40 +1,78 @@
-//! One sentence for whoever trained: what the latent found, and which key to turn first where that is little.
+//! One sentence for whoever trained: what the latent found, what there was to find, and which key to turn first where that is little.
 
-use super::{gate::Probed, learner::Scalars};
+use super::{gate::Probed, learner::Scalars, probe::Held};
+use crate::model::method::Looks;
 
 /// Errors of a probe above which the context counts as not found: half of its variance.
 const POOR: f64 = 0.5;
 /// Shares of what was surprising below which the latent explains next to nothing.
 const LITTLE: f64 = 0.05;
+/// Of what the tokens looked at leave, so much less must the whole past leave before a longer look is the first thing to try.
+const LONGER: f64 = 0.5;
 
-/// From errors on held-out blocks, by their names in the log, and a probe, where the data tell a context. Beside a baseline errors are shares of
-/// what was surprising; without one they say nothing of the latent alone.
-pub fn sentence(held_out: &Scalars, beside_baseline: bool, probe: Option<&Probed>) -> String {
-    let error = |name: &str| held_out.iter().find(|(found, _)| *found == name).map(|(_, error)| *error);
+/// What a sentence is made from.
+pub struct Found<'a> {
+    /// Errors on held-out blocks, by their names in the log.
+    pub held_out: &'a Scalars,
+    /// Whether those are shares of what was surprising; without a baseline they say nothing of the latent alone.
+    pub beside_baseline: bool,
+    /// How far back the encoder looks.
+    pub looks: Looks,
+    /// The probe and its ceilings, where the data tell a context.
+    pub context: Option<(Probed, Held)>,
+}
+
+/// The sentence.
+pub fn sentence(found: &Found) -> String {
+    let error = |name: &str| found.held_out.iter().find(|(found, _)| *found == name).map(|(_, error)| *error);
     let parts = ["state", "action", "reward"];
     let explained: Vec<(&str, f64)> = parts
         .into_iter()
         .filter_map(|part| Some((part, 1.0 - error(&format!("held_out_{part}_error"))?)))
-        .filter(|_| beside_baseline)
+        .filter(|_| found.beside_baseline)
         .collect();
     let mut text = "what is hidden:".to_string();
     if !explained.is_empty() {
         let shares: Vec<String> = explained.iter().map(|(part, share)| format!("{:.0} % in {part}s", 100.0 * share.max(0.0))).collect();
         text += &format!(" of what surprises a model without a context the latent explains {} (held-out episodes)", shares.join(", "));
     }
-    if let Some(probe) = probe {
+    if let Some((probe, held)) = &found.context {
         let joint = if explained.is_empty() { "" } else { ";" };
-        text += &format!("{joint} a linear probe of it finds infos/context to an error of {:.3} (0: exactly, 1: not at all)", probe.filter);
+        text +=
+            &format!("{joint} a linear probe of it finds infos/context to an error of {:.3} (0: exactly, 1: not at all), ", probe.filter);
+        text += &there_is(held, found.looks);
     }
-    if explained.is_empty() && probe.is_none() {
+    if explained.is_empty() && found.context.is_none() {
         return "what is hidden: not known, since the data tell no infos/context; model.latent.baseline would tell what the latent explains".into();
     }
-    let poor =
-        probe.is_some_and(|probe| probe.filter > POOR) || (!explained.is_empty() && explained.iter().all(|(_, share)| *share < LITTLE));
-    match (poor, beside_baseline) {
-        (false, _) => text,
-        (true, false) => text + ". That is little: try model.latent.baseline first",
-        (true, true) => text + ". That is little: try a longer look (model.latent.looks; \"running\" is the longest) or more steps",
+    let poor = found.context.is_some_and(|(probe, _)| probe.filter > POOR)
+        || (!explained.is_empty() && explained.iter().all(|(_, share)| *share < LITTLE));
+    if poor { text + ". That is little: " + advice(found) } else { text }
+}
+
+/// What the raw tokens hold, by the steps that the encoder looks at.
+fn there_is(held: &Held, looks: Looks) -> String {
+    let whole = format!("{:.3}", held.whole_past);
+    match looks {
+        Looks::Running => format!("raw tokens hold {whole}"),
+        Looks::Block(len) => format!("raw tokens hold {:.3} in {len} steps, {whole} in all of the past", held.looked_at),
+    }
+}
+
+/// The key to turn first: that without which the others do not help.
+fn advice(found: &Found) -> &'static str {
+    let held = found.context.map(|(_, held)| held);
+    let block = found.looks != Looks::Running;
+    if held.is_some_and(|held| held.looked_at.min(held.whole_past) > POOR) {
+        "the data themselves tell little of the context; record more action noise, a sensor more, or longer episodes before turning any key"
+    } else if block && held.is_some_and(|held| held.looked_at > POOR && held.whole_past < LONGER * held.looked_at) {
+        "it takes more steps to tell, as of a context that stays; try model.latent.looks = \"running\" first"
+    } else if !found.beside_baseline {
+        "try model.latent.baseline first"
+    } else if block {
+        "try a longer look (model.latent.looks; \"running\" is the longest) or more steps"
+    } else {
+        "try more steps, or a longer warm-up of losses.elbo.kl_weight"
     }
 }
 
@@ -42,17 +80,40 @@ pub fn sentence(held_out: &Scalars, beside_baseline: bool, probe: Option<&Probed
 mod tests {
     use super::*;
 
+    const BLOCK: Looks = Looks::Block(10);
+
+    fn told(errors: &Scalars, beside_baseline: bool, looks: Looks, context: Option<[f64; 3]>) -> String {
+        let context = context.map(|[filter, looked_at, whole_past]| {
+            let probed = Probed { filter, successor_state: None };
+            (probed, Held { looked_at, whole_past })
+        });
+        sentence(&Found { held_out: errors, beside_baseline, looks, context })
+    }
+
     #[test]
-    fn it_says_what_was_found_and_what_to_try() {
+    fn it_says_what_was_found_and_what_there_was() {
         let errors = |error: f64| vec![("held_out_elbo", 3.0), ("held_out_state_error", error), ("held_out_action_error", 0.64)];
-        let probe = |filter| Probed { filter, successor_state: None };
-        let found = sentence(&errors(0.58), true, Some(&probe(0.134)));
+        let found = told(&errors(0.58), true, Looks::Running, Some([0.134, 0.05, 0.05]));
         assert!(found.contains("42 % in states, 36 % in actions (held-out episodes); a linear probe"), "{found}");
-        assert!(found.contains("an error of 0.134") && !found.contains("little"), "{found}");
-        assert!(sentence(&errors(0.58), true, Some(&probe(0.9))).ends_with("or more steps"));
-        assert!(sentence(&errors(1.2), false, Some(&probe(0.9))).ends_with("try model.latent.baseline first"));
-        assert!(sentence(&vec![("held_out_state_error", 0.99)], true, None).contains("1 % in states"));
-        assert!(sentence(&vec![("held_out_state_error", 0.99)], true, None).contains("That is little"));
-        assert!(sentence(&errors(0.5), false, None).contains("not known"));
+        assert!(found.contains("an error of 0.134") && found.ends_with("raw tokens hold 0.050"), "{found}");
+        let block = told(&errors(0.58), true, BLOCK, Some([0.134, 0.08, 0.05]));
+        assert!(block.ends_with("raw tokens hold 0.080 in 10 steps, 0.050 in all of the past"), "{block}");
+        assert!(told(&errors(0.5), false, BLOCK, None).contains("not known"));
+        assert!(told(&vec![("held_out_state_error", 0.99)], true, BLOCK, None).contains("1 % in states"));
+    }
+
+    #[test]
+    fn it_says_which_key_to_turn_first() {
+        let advice = |beside_baseline, looks, context| told(&vec![("held_out_state_error", 0.5)], beside_baseline, looks, Some(context));
+        assert!(!advice(true, BLOCK, [0.4, 0.1, 0.1]).contains("little"));
+        assert!(advice(false, BLOCK, [0.9, 0.1, 0.1]).ends_with("try model.latent.baseline first"));
+        assert!(advice(true, BLOCK, [0.9, 0.1, 0.1]).ends_with("is the longest) or more steps"));
+        assert!(advice(true, Looks::Running, [0.9, 0.1, 0.1]).ends_with("losses.elbo.kl_weight"));
+        for beside_baseline in [false, true] {
+            assert!(advice(beside_baseline, BLOCK, [0.9, 0.7, 0.2]).ends_with("try model.latent.looks = \"running\" first"));
+            assert!(advice(beside_baseline, BLOCK, [0.9, 0.8, 0.7]).contains("the data themselves tell little"));
+        }
+        let explains_nothing = told(&vec![("held_out_state_error", 0.99)], true, BLOCK, None);
+        assert!(explains_nothing.contains("That is little: try a longer look"), "{explains_nothing}");
     }
 }

@@ -1,7 +1,6 @@
 //! How checkpoints are made: recipe -> data set -> its stages, one after the other -> checkpoint. Losses live beside the networks they
 //! train (`model/latent/elbo.rs`, `model/diffusion/refine.rs`); here batches are drawn for them and the crank is turned.
 pub mod amend;
-pub mod ceiling;
 #[cfg(test)]
 mod change_tests;
 mod crank;

@@ -1,83 +1,9 @@
-//! What `ada-trainer probe` and `ada-trainer inspect` print.
+//! What `ada-trainer inspect` prints, and how errors are told.
 
-use super::{
-    ceiling::ceiling,
-    dataset::{UnitsFrom, hdf5, room::Room},
-    probe::{Score, Subjects, latent_probe, probed},
-};
-use crate::model::{checkpoint, method::Looks, nn::plain};
-use anyhow::{Context, Result, ensure};
+use crate::model::{checkpoint, nn::plain};
+use anyhow::Result;
 use serde_json::{Value, json};
-use std::{collections::BTreeSet, path::Path};
-
-/// Places of each side that the probe uses.
-const ROWS: usize = 20_000;
-const SHIFTS: [i32; 3] = [-1, 0, 1];
-/// Block lengths of the ceiling beside a GRU that runs on.
-const CEILINGS: [usize; 3] = [1, 4, 10];
-
-/// Probes a checkpoint against a data set: block lengths 1, 2, 4 and T_x, every evidence, shifts -1, 0, 1, and the ceiling; and what a
-/// person should know about the data.
-///
-/// # Errors
-/// If either cannot be read, they do not fit, the model has no latent, or the data no context.
-pub fn probe(dir: &Path, data: &Path, room: &Room) -> Result<(Vec<Score>, Vec<String>)> {
-    let agent = checkpoint::load(dir)?;
-    let config = agent.config();
-    let latent = agent.networks().latent.as_ref().with_context(|| format!("{} has no latent to probe", dir.display()))?;
-    let mut dataset = hdf5::read(data, room)?;
-    let layout = dataset.layout();
-    ensure!(
-        layout == config.layout,
-        "{}: {} states and {} actions, but the checkpoint has {} and {}",
-        data.display(),
-        layout.state_dim,
-        layout.action_dim,
-        config.layout.state_dim,
-        config.layout.action_dim
-    );
-    dataset.leave_out_shorter(config.method.latent.block_len() + 2, "the block length + 2")?;
-    let notes = std::mem::take(&mut dataset.notes);
-    let (split, _) = dataset.split(UnitsFrom::Checkpoint(&config.units))?;
-    let subjects = Subjects { train: &split.train, held_out: &split.held_out, rows_max: ROWS };
-    let looks = config.method.latent.gru().map_or(Looks::Block(0), |gru| gru.looks);
-    let mut scores = Vec::new();
-    for looks in shorter(looks) {
-        for evidence in probed(latent) {
-            scores.extend(latent_probe(latent, &subjects, *evidence, looks, &SHIFTS)?);
-        }
-    }
-    let block_lens: Vec<usize> = shorter(looks).into_iter().map(Looks::block_len).collect();
-    scores.extend(ceiling(&subjects, if looks == Looks::Running { &CEILINGS } else { &block_lens })?);
-    Ok((scores, notes))
-}
-
-/// Block lengths up to the model's own; a GRU that runs on has none to choose.
-fn shorter(looks: Looks) -> Vec<Looks> {
-    match looks {
-        Looks::Block(own) => {
-            let lens: BTreeSet<usize> = [1, 2, 4, own].into_iter().filter(|len| *len <= own).collect();
-            lens.into_iter().map(Looks::Block).collect()
-        }
-        Looks::Running => vec![Looks::Running],
-    }
-}
-
-/// The probe as a table for people.
-pub fn probe_table(scores: &[Score]) -> String {
-    let head = "standardised mean squared error of a linear probe for the hidden context, on held-out episodes (1 - R2)\n\
-                source   evidence          block  shift    error      R2   error, all steps\n";
-    let line = |score: &Score| {
-        let evidence = format!("{:?}", score.evidence);
-        format!(
-            "{:<8} {evidence:<16} {:>6} {:>6} {:>8.4} {:>7.4} {:>8.4}\n",
-            score.source, score.block_len, score.shift, score.error, score.r2, score.error_all
-        )
-    };
-    let best = scores.iter().filter(|score| score.source == "latent").min_by(|a, b| a.error.total_cmp(&b.error));
-    let tail = best.map_or_else(String::new, |best| format!("least error of the latent at shift {}\n", best.shift));
-    head.to_string() + &scores.iter().map(line).collect::<String>() + &tail
-}
+use std::path::Path;
 
 /// Loads and checks a checkpoint and says what it is.
 ///

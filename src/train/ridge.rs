@@ -1,5 +1,7 @@
 //! Ridge regression in f64: the measuring stick of the probe.
 
+use std::ops::Range;
+
 /// Row-major numbers, `width` columns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Table {
@@ -33,6 +35,12 @@ impl Table {
     /// The rows at these indices.
     pub fn select(&self, rows: &[usize]) -> Self {
         Self { width: self.width, values: rows.iter().flat_map(|row| self.row(*row)).copied().collect() }
+    }
+
+    /// Some of the columns of all rows.
+    pub fn columns(&self, columns: Range<usize>) -> Self {
+        let rows = self.values.chunks(self.width.max(1));
+        Self { width: columns.len(), values: rows.flat_map(|row| &row[columns.clone()]).copied().collect() }
     }
 
     fn moments(&self) -> (Vec<f64>, Vec<f64>) {
@@ -81,6 +89,11 @@ impl Ridge {
         Self { mean, scale, offset, weights: cross }
     }
 
+    /// What is predicted where nothing is known: the targets' mean.
+    pub fn offset(&self) -> &[f64] {
+        &self.offset
+    }
+
     /// Predictions `(rows, targets)`.
     pub fn predict(&self, features: &Table) -> Table {
         let outputs = self.offset.len();
@@ -102,8 +115,8 @@ fn standardise(row: &[f64], mean: &[f64], scale: &[f64], out: &mut [f64]) {
     out.iter_mut().zip(row.iter().zip(mean).zip(scale)).for_each(|(out, ((v, mean), scale))| *out = (v - mean) * scale);
 }
 
-/// Cholesky in place on the lower triangle, then both substitutions; `b` becomes the solution.
-fn solve(a: &mut [f64], b: &mut [f64], n: usize, outputs: usize) {
+/// The Cholesky factor of a positive definite matrix, in place on its lower triangle.
+fn factor(a: &mut [f64], n: usize) {
     for i in 0..n {
         for j in 0..=i {
             let (head, tail) = a.split_at(i * n);
@@ -113,6 +126,26 @@ fn solve(a: &mut [f64], b: &mut [f64], n: usize, outputs: usize) {
             a[i * n + j] = if i == j { rest.max(1e-300).sqrt() } else { rest / a[j * n + j] };
         }
     }
+}
+
+/// The inverse of the Cholesky factor of a positive definite `(n, n)` matrix of second moments: rows that have these come out uncorrelated
+/// and of variance 1.
+pub fn inverse_factor(moments: &[f64], n: usize) -> Vec<f64> {
+    let (mut lower, mut inverse) = (moments.to_vec(), vec![0.0; n * n]);
+    factor(&mut lower, n);
+    for column in 0..n {
+        for i in column..n {
+            let unit = f64::from(u8::from(i == column));
+            let known: f64 = (column..i).map(|j| lower[i * n + j] * inverse[j * n + column]).sum();
+            inverse[i * n + column] = (unit - known) / lower[i * n + i];
+        }
+    }
+    inverse
+}
+
+/// Solves by Cholesky; `b` becomes the solution, `a` its factor.
+fn solve(a: &mut [f64], b: &mut [f64], n: usize, outputs: usize) {
+    factor(a, n);
     for column in 0..outputs {
         for i in 0..n {
             let dot: f64 = (0..i).map(|j| a[i * n + j] * b[j * outputs + column]).sum();
@@ -152,6 +185,24 @@ mod tests {
     }
 
     /// y = 3 x0 - 2 x1 + 5 + noise of variance .25: the weights are found and the standardised error is .25 / 13.25.
+    /// Mixed columns: what is whitened has the second moments of white noise.
+    #[test]
+    fn whitens() {
+        let mixed: Vec<f64> = normal(400, 3, 1).values.chunks(3).flat_map(|x| [x[0], 0.9 * x[0] + 0.1 * x[1], x[1] - 4.0 * x[2]]).collect();
+        let moments = |rows: &[f64]| -> Vec<f64> {
+            let product = |at: usize| rows.chunks(3).map(|row| row[at / 3] * row[at % 3]).sum::<f64>() / 400.0;
+            (0..9).map(product).collect()
+        };
+        let inverse = inverse_factor(&moments(&mixed), 3);
+        let white: Vec<f64> = mixed
+            .chunks(3)
+            .flat_map(|row| (0..3).map(|i| (0..3).map(|j| inverse[3 * i + j] * row[j]).sum::<f64>()).collect::<Vec<_>>())
+            .collect();
+        let white = moments(&white);
+        let error = white.iter().enumerate().map(|(at, value)| (value - f64::from(u8::from(at % 4 == 0))).abs());
+        assert!(error.fold(0.0, f64::max) < 1e-9, "{white:?}");
+    }
+
     #[test]
     fn finds_a_known_line() {
         let (x, noise) = (normal(4000, 3, 1), normal(4000, 1, 2));

@@ -5,10 +5,11 @@ use super::{
     dataset::{Split, UnitsFrom, hdf5, room::Room, units::ActionsConfig},
     learner::Learner,
     losses::Objective,
+    probe::{AGES, Answer, Question, Score, Source, probe},
     recipe::Recipe,
     resume, run,
 };
-use crate::model::checkpoint;
+use crate::model::{checkpoint, method::Looks};
 use std::{
     fs,
     path::{Path, PathBuf},
@@ -128,11 +129,24 @@ fn what_is_shipped_loads_and_says_where_it_comes_from() {
     assert!(provenance.recipe.contains("kappa = inf") && provenance.recipe.contains("data = \"data_good.h5\""), "{}", provenance.recipe);
     let rows = provenance.metrics["held_out_error_by_row"].as_array().unwrap().len();
     assert_eq!(rows, 2 * 4, "one error for each row of the ladder");
-    let probe = |room: &Room| super::report::probe(dir.path(), Path::new("tests/golden/data_good.h5"), room).unwrap().0;
+    let probe = |room: &Room| probed(dir.path(), room).scores;
     let scores = probe(&Room::default());
-    assert_eq!(scores, probe(&Room::new(Some(0), dir.path().join("rows"))), "rows from a file give the same scores");
-    let lines = |source: &str| scores.iter().filter(|score| score.source == source).count();
-    assert_eq!((lines("latent"), lines("ceiling")), (3 * 3 * 3, 3 * 2), "block lengths 1, 2, 3; three shifts; what was seen");
+    // As text, since no age is as old as the last: NaN.
+    let from_file = probe(&Room::new(Some(0), dir.path().join("rows")));
+    assert_eq!(format!("{scores:?}"), format!("{from_file:?}"), "rows from a file give the same scores");
+    let lines = |source| scores.iter().filter(|score| score.source == source).count();
+    assert_eq!(lines(Source::Latent), 3 * 3 * 3 + 2, "block lengths 1, 2, 3; three shifts; what was seen; two roll-outs");
+    assert_eq!((lines(Source::Ceiling), lines(Source::CeilingWithoutActions)), (4 * (3 + 1), 4 * (3 + 1)), "and the whole past");
+    let rows = probed(dir.path(), &Room::default()).rows();
+    assert_eq!(rows.len(), (3 * 2 + 2) * (1 + AGES.len()));
+    assert!(rows.iter().all(|row| (row.environment.as_str(), row.method.as_str(), row.seed) == ("data_good", "small", 3)));
+    assert!(rows.iter().all(|row| row.mse.is_some() == row.ceiling.is_some() && row.block_len.is_some()), "{rows:?}");
+}
+
+/// A checkpoint held against the data set of all these tests, two steps ahead.
+fn probed(checkpoint: &Path, room: &Room) -> Answer {
+    let data = Path::new("tests/golden/data_good.h5");
+    probe(&Question { checkpoint, data, ahead: 2, own_rollouts: false, environment: None, method: None }, room).unwrap()
 }
 
 /// A recipe's text without one section.
@@ -203,13 +217,23 @@ fn a_baseline_is_trained_first_and_held() {
     let of_baseline: Vec<_> = last.keys().filter(|name| name.starts_with("latent.baseline.")).collect();
     assert!(of_baseline.len() > 10);
     of_baseline.iter().for_each(|name| assert_eq!(flat(&early[&format!("var.{name}")]), flat(&last[*name]), "{name}"));
-    let scale = flat(&last["latent.baseline.surprise.state.scale"]);
-    assert!(scale.iter().all(|scale| scale.is_finite() && *scale > 0.0 && *scale != 1.0), "{scale:?}");
+    // Whitened by the inverse of a Cholesky factor, a lower triangle.
+    let whitener = flat(&last["latent.baseline.surprise.state.weight"]);
+    let right = |(at, value): (usize, &f32)| match (at % 3).cmp(&(at / 3)) {
+        std::cmp::Ordering::Less => value.is_finite(),
+        std::cmp::Ordering::Equal => value.is_finite() && *value > 0.0,
+        std::cmp::Ordering::Greater => *value == 0.0,
+    };
+    assert!(whitener.len() == 9 && whitener.iter().enumerate().all(right), "{whitener:?}");
     assert_ne!(flat(&early["var.latent.encoder.mean.weight"]), flat(&last["latent.encoder.mean.weight"]));
     let agent = checkpoint::load(&dir.path().join("whole")).unwrap();
     assert!(agent.spec().trained.refined && agent.spec().trained.action_horizons == [1]);
-    let scores = super::report::probe(&dir.path().join("whole"), Path::new("tests/golden/data_good.h5"), &Room::default()).unwrap().0;
-    assert!(scores.iter().any(|score| score.source == "latent" && score.block_len == 0 && score.error.is_finite()));
+    let answer = probed(&dir.path().join("whole"), &Room::default());
+    let runs_on = |score: &&Score| score.source == Source::Latent && score.looks == Looks::Running;
+    assert!(answer.scores.iter().filter(runs_on).all(|score| score.errors.whole.is_finite()));
+    let rows = answer.rows();
+    assert!(rows.iter().all(|row| row.looks == "running" && row.block_len.is_none()));
+    assert!(rows.iter().filter(|row| row.age.is_none()).all(|row| row.ceiling.is_some() && row.ceiling_without_actions.is_some()));
 }
 
 /// A baseline is nothing to add in passing: what a recipe lacks or has too much for it is named.

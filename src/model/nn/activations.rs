@@ -3,7 +3,7 @@
 //! Training runs it on candle's tensors, which record the way back; inference on [`super::Buffer`]s, plain numbers in pooled memory. Both go
 //! through the same operations ([`Op`]) and give the same bits.
 
-use super::{Absent, Difference, kernels::activation::Activation, layer::Layer, op::Op};
+use super::{Absent, kernels::activation::Activation, layer::Layer, op::Op};
 use candle_core::{Result, bail};
 
 /// Activations `(batch, steps, channels)`. Every operation is an error where shapes do not fit each other.
@@ -112,12 +112,12 @@ pub trait Activations: Clone {
         self.run(&Layer::plain(Op::Step(index)), &[])
     }
 
-    /// `(self - expected) scale`, column by column.
+    /// `self - other`.
     ///
     /// # Errors
     /// If shapes differ.
-    fn difference(self, expected: &Self, of: &Difference) -> Result<Self> {
-        self.run_in_place(&of.0, &[expected])
+    fn minus(self, other: &Self) -> Result<Self> {
+        self.run_in_place(&Layer::plain(Op::Subtract), &[other])
     }
 
     /// Rows where `present` (`(batch, steps, 1)`) is 1, the learned vector where it is 0.

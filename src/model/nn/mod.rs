@@ -12,7 +12,6 @@ mod buffer;
 #[cfg(test)]
 mod candle_faults;
 pub mod conv1d;
-mod difference;
 pub mod gru;
 pub mod host;
 pub mod kernels;
@@ -33,7 +32,6 @@ pub use absent::Absent;
 pub use activations::Activations;
 pub use buffer::Buffer;
 pub use conv1d::{Conv1d, ConvShape, ConvTranspose1d};
-pub use difference::Difference;
 pub use gru::Gru;
 pub use kernels::{activation::Activation, product::Precision};
 pub use layer::Layer;

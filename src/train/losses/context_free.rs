@@ -3,7 +3,7 @@
 use super::{Job, Mean, Part};
 use crate::model::{
     Networks,
-    latent::{Baseline, SCALES, Tokens},
+    latent::{Baseline, Tokens, WHITENERS},
     noise::Philox,
     trajectory::Seen,
 };
@@ -15,6 +15,7 @@ use crate::train::{
     },
     probe::places,
     recipe::losses::Loss,
+    ridge::inverse_factor,
 };
 use anyhow::{Context, Result};
 use candle_core::{Tensor, Var};
@@ -22,9 +23,9 @@ use std::collections::BTreeMap;
 
 /// Held-out transitions over which surprises are measured.
 const HELD_OUT_ROWS: usize = 20_000;
-/// Least standard deviation of a surprise: that of a state column in units of its change, that of the others in those of the data. What a
+/// Standard deviation of a noise beside every residual: of a state column in units of its change, of the others in those of the data. What a
 /// baseline knows exactly is not to be looked at through a microscope.
-const FLOOR: f32 = 0.02;
+const FLOOR: f64 = 0.02;
 
 /// Draws transitions and evaluates the loss.
 pub struct ContextFreeLoss<'a> {
@@ -76,7 +77,8 @@ impl<'a> ContextFreeLoss<'a> {
     }
 }
 
-/// Measures on held-out transitions how far off the baseline is, and makes that the unit of surprises.
+/// Measures on held-out transitions how far off the baseline is, and makes that the unit of surprises: the inverse of the Cholesky factor of
+/// the residuals' second moments.
 ///
 /// # Errors
 /// If a tensor operation fails.
@@ -84,13 +86,21 @@ pub fn measure_surprises(task: &Task, networks: &Networks, vars: &BTreeMap<Strin
     let episodes = &task.split.held_out;
     let residuals = baseline(networks)?.residuals(&transitions(episodes, &places(episodes, HELD_OUT_ROWS))?)?;
     let change = &task.config.units.normalizer.state_change_std;
-    for (index, (residual, name)) in residuals.iter().zip(SCALES).enumerate() {
-        let variance = residual.sqr()?.mean((0, 1))?.to_vec1::<f32>()?;
-        let floor = |column: usize| if index == 0 { FLOOR * change[column] } else { FLOOR };
-        let scale = variance.iter().enumerate().map(|(column, variance)| 1.0 / variance.sqrt().max(floor(column)).max(f32::MIN_POSITIVE));
-        let scale = Tensor::from_iter(scale, residual.device())?;
+    for (index, (residual, name)) in residuals.iter().zip(WHITENERS).enumerate() {
+        let (rows, _, width) = residual.dims3()?;
+        let unit = |column: usize| f64::from(if index == 0 { change[column].max(f32::MIN_POSITIVE) } else { 1.0 });
+        let mut moments = vec![0.0; width * width];
+        for row in residual.reshape((rows, width))?.to_vec2::<f32>()? {
+            let row: Vec<f64> = row.iter().enumerate().map(|(column, value)| f64::from(*value) / unit(column)).collect();
+            moments.iter_mut().enumerate().for_each(|(at, sum)| *sum += row[at / width] * row[at % width]);
+        }
+        moments.iter_mut().for_each(|sum| *sum /= rows.max(1) as f64);
+        (0..width).for_each(|column| moments[column * (width + 1)] += FLOOR * FLOOR);
+        let inverse = inverse_factor(&moments, width);
+        let whitener = inverse.iter().enumerate().map(|(at, value)| (value / unit(at % width)) as f32).collect::<Vec<_>>();
         let name = format!("latent.baseline.{name}");
-        vars.get(&name).with_context(|| format!("no variable {name}: is a bug"))?.set(&scale)?;
+        let whitener = Tensor::from_vec(whitener, (width, width), residual.device())?;
+        vars.get(&name).with_context(|| format!("no variable {name}: is a bug"))?.set(&whitener)?;
     }
     Ok(())
 }

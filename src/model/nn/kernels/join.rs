@@ -104,33 +104,9 @@ per_isa! {
 }
 
 per_isa! {
-    /// `x = (x - y) scale` by column.
-    pub fn difference(x: &mut [f32], y: &[f32], scale: &[f32]) {
-        let width = scale.len().max(1);
-        for (x, y) in x.chunks_exact_mut(width).zip(y.chunks_exact(width)) {
-            x.iter_mut().zip(y.iter().zip(scale)).for_each(|(x, (y, scale))| *x = (*x - y) * scale);
-        }
-    }
-}
-
-per_isa! {
-    /// The gradient to [`difference`]'s scale from the one to its result.
-    pub fn difference_scale_grad(x: &[f32], y: &[f32], grad: &[f32], d_scale: &mut [f32]) {
-        let width = d_scale.len().max(1);
-        let rows = x.chunks_exact(width).zip(y.chunks_exact(width)).zip(grad.chunks_exact(width));
-        for ((x, y), grad) in rows {
-            let columns = d_scale.iter_mut().zip(x.iter().zip(y).zip(grad));
-            columns.for_each(|(d_scale, ((x, y), grad))| *d_scale = (x - y).mul_add(*grad, *d_scale));
-        }
-    }
-}
-
-per_isa! {
-    /// `x[row, c] *= scale[c]`.
-    pub fn scale_columns(x: &mut [f32], scale: &[f32]) {
-        for row in x.chunks_exact_mut(scale.len().max(1)) {
-            row.iter_mut().zip(scale).for_each(|(x, scale)| *x *= scale);
-        }
+    /// `x -= y`.
+    pub fn subtract(x: &mut [f32], y: &[f32]) {
+        x.iter_mut().zip(y).for_each(|(x, y)| *x -= y);
     }
 }
 

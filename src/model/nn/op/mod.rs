@@ -61,11 +61,8 @@ pub enum Op {
     },
     /// One step alone, `(batch, 1, channels)`.
     Step(usize),
-    /// `(x - other) weight`, the weight a scale of each column.
-    Difference {
-        /// Channels.
-        width: usize,
-    },
+    /// `x - other`.
+    Subtract,
     /// Rows where the other, `(batch, steps, 1)`, is 1; the weight, a vector, where it is 0. The mask gets no gradient.
     OrAbsent {
         /// Channels.
@@ -114,7 +111,7 @@ impl Op {
     pub fn form(&self) -> Form {
         match self {
             Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Beside | Self::Channels { .. } | Self::Step(_) => Form::Anew,
-            Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::Difference { .. } | Self::OrAbsent { .. } => Form::InPlace,
+            Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::Subtract | Self::OrAbsent { .. } => Form::InPlace,
             Self::AddAtEachStep | Self::AddGated => Form::Sum(1),
             Self::Add => Form::Sum(2),
         }
@@ -145,7 +142,7 @@ impl Op {
             }
             Self::Channels { start, len } => beside(&[], start + len <= channels, [batch, steps, len]),
             Self::Step(index) => beside(&[], index < steps, [batch, 1, channels]),
-            Self::Difference { width } => beside(&[x], channels == width, x),
+            Self::Subtract => beside(&[x], true, x),
             Self::OrAbsent { width } => beside(&[[batch, steps, 1]], channels == width, x),
         };
         let shapes = || inputs.iter().map(|input| input.shape).collect::<Vec<_>>();
@@ -180,7 +177,7 @@ impl Op {
             }
             Self::Channels { start, len } => join::copy_columns((x, channels, start), (out, len, 0), len),
             Self::Step(index) => join::copy_columns((x, steps * channels, index * channels), (out, channels, 0), channels),
-            Self::Difference { .. } => join::difference(out, other(1), weights.plain()?),
+            Self::Subtract => join::subtract(out, other(1)),
             Self::OrAbsent { .. } => join::or_absent(out, other(1), weights.plain()?),
         }
         Ok(())
@@ -226,16 +223,8 @@ impl Op {
             Self::Step(index) => {
                 fill(&mut to[0], |dx| join::copy_columns((grad, channels, 0), (dx, steps * channels, index * channels), channels));
             }
-            Self::Difference { .. } => {
-                let scale = past.weights.plain()?;
-                fill(&mut to[0], |dx| join::scale_columns(dx, scale));
-                fill(&mut to[1], |dy| {
-                    dy.copy_from_slice(grad);
-                    join::scale_columns(dy, scale);
-                    dy.iter_mut().for_each(|dy| *dy = -*dy);
-                });
-                fill(&mut to[2], |d_scale| join::difference_scale_grad(x, other(1), grad, d_scale));
-            }
+            // The slot of `x` holds its gradient already.
+            Self::Subtract => fill(&mut to[1], |dy| dy.iter_mut().zip(grad).for_each(|(dy, grad)| *dy = -grad)),
             Self::OrAbsent { .. } => {
                 if to[1].is_some() {
                     bail!("a mask gets no gradient");
