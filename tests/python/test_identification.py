@@ -13,6 +13,8 @@ from server import BINARY, ROOT
 
 REPORT = ROOT / "report/identification.json"
 AGES = [None, [0, 10], [10, 30], [30, 80], [80, None]]
+READOUT = {"standard_error", "episodes"}
+"""Keys more of a row that `ada-evaluate --readout` found: the agent's own episodes have no ceiling, and an error over them."""
 KEYS = {
     "environment",
     "seed",
@@ -30,14 +32,15 @@ KEYS = {
 
 
 def check(row: dict[str, Any]) -> None:
-    assert set(row) == KEYS
+    readout = row.keys() >= READOUT
+    assert set(row) == (KEYS | READOUT if readout else KEYS)
     assert isinstance(row["environment"], str) and isinstance(row["method"], str) and row["environment"] and row["method"]
     assert isinstance(row["seed"], int) and row["seed"] >= 0
     assert row["where"] in ("held_out", "own_rollouts")
     assert row["evidence"] in ("filter", "successor", "prior")
     assert isinstance(row["ahead"], int) and (row["ahead"] > 0) == (row["evidence"] == "prior")
     assert (row["looks"], row["block_len"]) == ("running", None) or (row["looks"] == "block" and row["block_len"] >= 0)
-    assert row["age"] in AGES
+    assert row["age"] in ([*AGES, [50, None]] if readout else AGES)
     for error in ("mse", "ceiling", "ceiling_without_actions"):
         assert row[error] is None or (isinstance(row[error], float | int) and math.isfinite(row[error]) and row[error] >= 0)
 
@@ -51,6 +54,8 @@ def number(error: float | None) -> str:
 
 
 def told(row: dict[str, Any]) -> str:
+    if "standard_error" in row:
+        return f"{number(row['mse'])} ± {number(row['standard_error'])}"
     return " / ".join(number(row[error]) for error in ("mse", "ceiling", "ceiling_without_actions"))
 
 

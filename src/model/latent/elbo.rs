@@ -126,17 +126,14 @@ impl LatentModel {
     /// # Errors
     /// If shapes differ.
     pub fn elbo(&self, batch: &ElboBatch, options: &ElboOptions) -> Result<ElboTerms> {
-        let (_, len) = batch.tokens.batch_len()?;
         let surprises = self.surprises(&batch.tokens)?;
         let Explained { q, from } = self.explained(surprises.as_ref(), batch)?;
-        let (steps, valid) = (len - 1 - from, batch.valid.narrow(1, from, len - 1 - from)?);
         let (latent, stays) = self.drawn(&q, batch, from)?;
-        let aims = Aims::new(batch, surprises.as_ref(), from, options)?;
-        let now = batch.tokens.narrow(from, steps)?;
-        let errors = self.errors(&now, &latent, &aims, &valid)?;
-        let kl = self.block_kl(&q, stays.as_ref(), &valid, options.free_bits)?;
+        let steps = Steps::new(batch, surprises.as_ref(), from, options)?;
+        let errors = self.errors(&latent, &steps)?;
+        let kl = self.block_kl(&q, stays.as_ref(), &steps.valid, options.free_bits)?;
         let mut loss = (self.weighted(&errors, options)? + kl.affine(options.kl_weight, 0.0)?)?;
-        let ahead = self.ahead(&q, &now, &aims, &valid, options)?;
+        let ahead = self.ahead(&q, &steps, options)?;
         if let Some(error) = &ahead {
             loss = (loss + error.affine(options.ahead.weight, 0.0)?)?;
         }
@@ -145,7 +142,7 @@ impl LatentModel {
     }
 
     /// How far what latents say of steps is from what they have to explain: means over valid steps and columns.
-    fn errors(&self, now: &Tokens, latent: &Tensor, aims: &Aims, valid: &Tensor) -> Result<Errors> {
+    fn errors(&self, latent: &Tensor, Steps { now, aims, valid }: &Steps) -> Result<Errors> {
         let told = self.decoder.predict(&now.state, &now.action, latent)?;
         let count = valid.sum_all()?;
         let error = |told: Tensor, aim: &Tensor| -> Result<Tensor> {
@@ -177,22 +174,20 @@ impl LatentModel {
     }
 
     /// Mean weighted error of the steps after each belief's own; see [`Ahead`]. As many of them as a block has room for.
-    fn ahead(&self, q: &Gaussian, now: &Tokens, aims: &Aims, valid: &Tensor, options: &ElboOptions) -> Result<Option<Tensor>> {
-        let all = valid.dim(1)?;
-        let (mut sum, mut steps) = (None, 0);
+    fn ahead(&self, q: &Gaussian, steps: &Steps, options: &ElboOptions) -> Result<Option<Tensor>> {
+        let all = q.mean.dim(1)?;
+        let (mut sum, mut by) = (None, 0);
         self.roll_out(q.clone(), options.ahead.steps.min(all - 1), |next| {
-            steps += 1;
-            let rest = all - steps;
-            let latent = next.mean.narrow(1, 0, rest)?.contiguous()?;
-            let errors = self.errors(&now.narrow(steps, rest)?, &latent, &aims.narrow(steps, rest)?, &valid.narrow(1, 0, rest)?)?;
-            let error = self.weighted(&errors, options)?;
+            by += 1;
+            let latent = next.mean.narrow(1, 0, all - by)?.contiguous()?;
+            let error = self.weighted(&self.errors(&latent, &steps.later(by)?)?, options)?;
             sum = Some(match sum.take() {
                 None => error,
                 Some(sum) => (sum + error)?,
             });
             Ok(())
         })?;
-        sum.map(|sum: Tensor| sum / steps as f64).transpose()
+        sum.map(|sum: Tensor| sum / by as f64).transpose()
     }
 
     /// The latents that explain the steps of a block, and the first step that has one: c_t of a model with a prior waits for what is shown of
@@ -252,6 +247,33 @@ impl LatentModel {
             (Some(kl), None) | (None, Some(kl)) => Ok(kl),
             (None, None) => candle_core::bail!("a latent that neither stays nor moves: is a bug"),
         }
+    }
+}
+
+/// Steps that latents have to explain.
+struct Steps {
+    /// Their own tokens, `(B, steps)`.
+    now: Tokens,
+    aims: Aims,
+    /// `(B, steps)`: 1 where the belief that explains a step, and so the step, is real.
+    valid: Tensor,
+}
+
+impl Steps {
+    /// From step `from` of a block on.
+    fn new(batch: &ElboBatch, surprises: Option<&Surprises>, from: usize, options: &ElboOptions) -> Result<Self> {
+        let steps = batch.tokens.batch_len()?.1 - 1 - from;
+        Ok(Self {
+            now: batch.tokens.narrow(from, steps)?,
+            aims: Aims::new(batch, surprises, from, options)?,
+            valid: batch.valid.narrow(1, from, steps)?,
+        })
+    }
+
+    /// The steps that are later by so many than those of the same beliefs.
+    fn later(&self, by: usize) -> Result<Self> {
+        let rest = self.valid.dim(1)? - by;
+        Ok(Self { now: self.now.narrow(by, rest)?, aims: self.aims.narrow(by, rest)?, valid: self.valid.narrow(1, 0, rest)? })
     }
 }
 
