@@ -45,9 +45,9 @@ pub fn sentence(found: &Found) -> String {
     if explained.is_empty() && found.context.is_none() {
         return "what is hidden: not known, since the data tell no infos/context; model.latent.baseline would tell what the latent explains".into();
     }
-    let poor = found.context.is_some_and(|(probe, _)| probe.filter > POOR)
-        || (!explained.is_empty() && explained.iter().all(|(_, share)| *share < LITTLE));
-    if poor { text + ". That is little: " + advice(found) } else { text }
+    let little = !explained.is_empty() && explained.iter().all(|(_, share)| *share < LITTLE);
+    let poor = found.context.is_some_and(|(probe, _)| probe.filter > POOR) || little;
+    if poor { text + ". That is little: " + advice(found, little) } else { text }
 }
 
 /// What the raw tokens hold, by the steps that the encoder looks at.
@@ -60,7 +60,7 @@ fn there_is(held: &Held, looks: Looks) -> String {
 }
 
 /// The key to turn first: that without which the others do not help.
-fn advice(found: &Found) -> &'static str {
+fn advice(found: &Found, explains_little: bool) -> &'static str {
     let held = found.context.map(|(_, held)| held);
     let block = found.looks != Looks::Running;
     if held.is_some_and(|held| held.looked_at.min(held.whole_past) > POOR) {
@@ -71,8 +71,11 @@ fn advice(found: &Found) -> &'static str {
         "try model.latent.baseline first"
     } else if block {
         "try a longer look (model.latent.looks; \"running\" is the longest) or more steps"
+    } else if explains_little {
+        "try a smaller losses.elbo.kl_weight, or more steps"
     } else {
-        "try more steps, or a longer warm-up of losses.elbo.kl_weight"
+        "what it explains is something else, a step's own noise or what the baseline has yet to learn; try more steps of the baseline, then \
+         model.latent.future = \"held\" with a small losses.elbo.kl_weight"
     }
 }
 
@@ -115,5 +118,7 @@ mod tests {
         }
         let explains_nothing = told(&vec![("held_out_state_error", 0.99)], true, BLOCK, None);
         assert!(explains_nothing.contains("That is little: try a longer look"), "{explains_nothing}");
+        let runs_on = told(&vec![("held_out_state_error", 0.99)], true, Looks::Running, Some([0.9, 0.1, 0.1]));
+        assert!(runs_on.ends_with("try a smaller losses.elbo.kl_weight, or more steps"), "{runs_on}");
     }
 }
