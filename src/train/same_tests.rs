@@ -16,7 +16,7 @@ use crate::model::{
         refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
         schedule::Table,
     },
-    method::{Backbone, Baseline, Future, GruLatent, LatentSource, Looks, Schedule},
+    method::{Actions, Backbone, Baseline, Future, GruLatent, LatentSource, Looks, Schedule},
     nn::Params,
     noise::Philox,
     options::SamplerOptions,
@@ -50,6 +50,14 @@ fn config(latent: Option<(Looks, Future)>, schedule: Schedule, obs_horizon: usiz
 fn beside_baseline(mut config: ModelConfig) -> ModelConfig {
     let LatentSource::Gru(gru) = &mut config.method.latent else { panic!("a latent") };
     gru.baseline = Some(Baseline { width: 7 });
+    config.check().unwrap();
+    config
+}
+
+/// The same where two columns stay and no action is seen.
+fn partly_staying(mut config: ModelConfig) -> ModelConfig {
+    let LatentSource::Gru(gru) = &mut config.method.latent else { panic!("a latent") };
+    (gru.stays, gru.actions) = (2, Actions::Unseen);
     config.check().unwrap();
     config
 }
@@ -183,6 +191,7 @@ fn surprises() {
     {
         let config = beside_baseline(config(Some((looks, future)), ladder, obs_horizon, 1));
         [Hide::NOTHING, hide].into_iter().for_each(|hide| check(&config, hide));
+        check(&partly_staying(config), hide);
     }
 }
 

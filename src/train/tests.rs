@@ -314,6 +314,14 @@ fn a_gate_on_constant_contexts_says_so() {
     assert!(error.contains("`stages.identify.gate`") && error.contains("never changes"), "{error}");
 }
 
+/// What a latent is to tell must be what the data recorded.
+#[test]
+fn a_context_of_another_width_is_not_told() {
+    let keys = ["model.latent.tells=7", "losses.elbo.context_weight=1.0"];
+    let error = Task::new(recipe_with(&keys).unwrap(), &Room::default()).err().unwrap().to_string();
+    assert!(error.contains("`model.latent.tells`: is 7, but `infos/context`"), "{error}");
+}
+
 #[test]
 fn wrong_recipes_name_the_key() {
     for (text, key) in [
@@ -328,6 +336,11 @@ fn wrong_recipes_name_the_key() {
         ("stages.denoise.keeps={least_held_out = 5}", "stages.denoise.keeps"),
         ("stages.identify.keeps={least_probe = 0}", "stages.identify.keeps.least_probe"),
         ("model.latent.stays=2", "model.latent.stays"),
+        ("model.latent.tells=1", "losses.elbo.context_weight"),
+        ("losses.elbo.context_weight=1.0", "losses.elbo.context_weight"),
+        ("losses.elbo.ahead={steps = 99999, weight = 1.0}", "losses.elbo.ahead.steps"),
+        ("losses.elbo.ahead={steps = 1, weight = -1.0}", "losses.elbo.ahead.weight"),
+        ("model.latent.actions=guessed", "guessed"),
         ("stages.identify.weight_decay=-1.0", "stages.identify.weight_decay"),
         ("model.plan.backbone={kind = \"dit\", width = 9, depth = 1, heads = 3}", "model.plan.backbone.width"),
         ("losses.denoise.ready_fraction=1.5", "losses.denoise.ready_fraction"),
