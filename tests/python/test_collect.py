@@ -123,6 +123,40 @@ def test_a_share_is_flown_blind_and_the_file_and_the_card_say_which(tmp_path):
     assert not np.array_equal(load_episodes(tmp_path / "other.h5").blind, episodes.blind)
 
 
+def test_play_is_flown_under_the_context_of_another_world(tmp_path):
+    path = tmp_path / "x.h5"
+    flags = ["--env", "pendulum-torque-s", "--episodes", "12", "--action-noise", "0", "--blind", "0.25", "--play", "0.5", "--seed", "4"]
+    assert run(path, *flags) == 0
+    episodes, card = load_episodes(path), json.loads(card_path(path).read_text())
+    assert (episodes.play.reshape(12, 200).sum(axis=1) % 200 == 0).all() and not (episodes.play & episodes.blind).any()
+    pilot = environments.PendulumTorqueS()
+    told_truth = np.array([a == pytest.approx(pilot.expert_action(o, c), abs=1e-5) for o, a, c in _steps(episodes)])
+    assert told_truth[~episodes.play & ~episodes.blind].all() and told_truth[episodes.play].mean() < 0.3  # at the bounds they agree
+    card = card["play"]
+    assert (card["share"], card["played"]["episodes"], card["demonstrated"]["episodes"]) == (0.5, 6, 6)
+    played = episodes.play.reshape(12, 200)[:, 0]
+    assert card["played"]["returns"]["mean"] == pytest.approx(episodes.returns()[played].mean(), abs=1e-3)
+
+    assert run(tmp_path / "again.h5", *flags) == 0
+    assert path.read_bytes() == (tmp_path / "again.h5").read_bytes()
+
+
+def test_the_actions_of_play_say_nothing_of_the_context(tmp_path):
+    path = tmp_path / "x.h5"
+    assert run(path, "--env", "point-wind-s", "--episodes", "200", "--play", "0.5", "--action-noise", "0") == 0
+    episodes = load_episodes(path)
+    step = np.tile(np.arange(200) == 0, 200)  # the first: later ones show in the state what the wind did
+    for play, least, most in ((False, 0.8, 1.0), (True, 0.0, 0.25)):
+        at = step & (episodes.play == play)
+        seen = np.column_stack([episodes.observations[at], np.ones(at.sum())])
+        rest = [part - seen @ np.linalg.lstsq(seen, part, rcond=None)[0] for part in (episodes.actions[at], episodes.context[at])]
+        assert least <= abs(np.corrcoef(rest[0][:, 0], rest[1][:, 0])[0, 1]) <= most, play
+
+
+def _steps(episodes):
+    return zip(episodes.observations, episodes.actions, episodes.context, strict=True)
+
+
 def test_without_blind_episodes_nothing_is_said_of_them(tmp_path):
     assert run(tmp_path / "x.h5", "--env", "point-wind-s") == 0
     assert run(tmp_path / "y.h5", "--env", "point-wind-s", "--blind", "0") == 0
@@ -151,6 +185,8 @@ def test_a_blind_expert_is_searched_for_kept_and_used_again(tmp_path):
     [
         (["--env", "point-wind-s", "--blind", "1.5"], "--blind"),
         (["--env", "point-wind-s", "--blind", "nan"], "--blind"),
+        (["--env", "point-wind-s", "--play", "1"], "--play"),
+        (["--env", "point-wind-s", "--play", "0.6", "--blind", "0.5"], "--play"),
         (["--env", "point-wind-s", "--blind-expert", "random"], "--blind"),
         (["--env", "Pendulum-v1", "--expert", "random", "--blind", "0.5"], "--blind-expert"),
         (["--env", "cheetah-rain"], "cheetah-wind-s"),

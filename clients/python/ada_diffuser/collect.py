@@ -27,6 +27,8 @@ class Job:
         seed: of the environment, the noise and the choice among `noise`.
         episode_steps: where episodes are truncated; None: where the environment is registered to be.
         blind: share of the episodes, 0 to 1, that an expert flies which does not see the context; drawn by the seed.
+        play: share of the episodes that the expert flies told the context of another world: its actions say nothing of the true one, and
+            are nothing to imitate.
     """
 
     env: str
@@ -36,11 +38,18 @@ class Job:
     seed: int
     episode_steps: int | None = None
     blind: float = 0.0
+    play: float = 0.0
 
     def flown_blind(self) -> np.ndarray:
         """Which episodes, (episodes,) bool: their number is the share's, rounded; which ones has its own stream of chance."""
-        flags = np.arange(self.episodes) < round(self.blind * self.episodes)
-        return np.random.default_rng([self.seed, 4]).permutation(flags)
+        return self._order() < round(self.blind * self.episodes)
+
+    def played(self) -> np.ndarray:
+        """Which episodes are play, (episodes,) bool; none of them is flown blind."""
+        return ~self.flown_blind() & (self._order() < round((self.blind + self.play) * self.episodes))
+
+    def _order(self) -> np.ndarray:
+        return np.random.default_rng([self.seed, 4]).permutation(np.arange(self.episodes))
 
 
 def collect(
@@ -50,21 +59,27 @@ def collect(
 
     `progress` is called with the number of episodes just flown. `blind` flies the share that the job wants flown blind.
     """
-    flown_blind = job.flown_blind()
+    flown_blind, played = job.flown_blind(), job.played()
     if blind is None and flown_blind.any():
         raise ValueError("a job with a blind share needs a blind expert")
     env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
     env_seed, noise_seed = np.random.SeedSequence(job.seed).generate_state(2)
     rng = np.random.default_rng(noise_seed)
+    other = _OtherWorld(job) if played.any() else None
     flown, failed = [], np.zeros(job.episodes, np.bool_)
-    for episode, is_blind in enumerate(flown_blind):
+    for episode, (is_blind, is_play) in enumerate(zip(flown_blind, played, strict=True)):
         std = float(rng.choice(job.noise))
-        flown.append(_fly(env, blind if is_blind else expert, std, rng, int(env_seed) if episode == 0 else None))
+        pilot, told = blind if is_blind else expert, other if is_play else None
+        flown.append(_fly(env, pilot, std, rng, int(env_seed) if episode == 0 else None, told))
         failed[episode] = environments.failed(env, float(flown[-1].rewards.sum()))
         if job.blind:
             flown[-1].blind = np.full(len(flown[-1].rewards), is_blind)
+        if job.play:
+            flown[-1].play = np.full(len(flown[-1].rewards), is_play)
         progress(1)
     env.close()
+    if other:
+        other.close()
     columns = {name: [getattr(e, name) for e in flown] for name in Episodes.__dataclass_fields__}
     return Episodes(**{name: None if parts[0] is None else np.concatenate(parts) for name, parts in columns.items()}), failed
 
@@ -86,19 +101,51 @@ def _context(env: gym.Env) -> np.ndarray | None:
     return getattr(env.unwrapped, "context", None)
 
 
-def _fly(env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, seed: int | None) -> Episodes:
-    """One episode with action noise `std`."""
+class _OtherWorld:
+    """Another episode of the same environment, under the same actions: its context is drawn as the true one is, and has nothing to do with
+    it."""
+
+    def __init__(self, job: Job) -> None:
+        self._env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
+        self._rng, self._ended = np.random.default_rng([job.seed, 5]), True
+
+    def begin(self) -> None:
+        # A session of its own, so that what lasts over episodes is drawn anew too.
+        self._env.reset(seed=int(self._rng.integers(2**31)))
+        self._ended = False
+
+    @property
+    def context(self) -> np.ndarray | None:
+        return _context(self._env)
+
+    def follow(self, action: np.ndarray) -> None:
+        if not self._ended:  # what it was at the end holds
+            _, _, terminal, timeout, _ = self._env.step(action)
+            self._ended = terminal or timeout
+
+    def close(self) -> None:
+        self._env.close()
+
+
+def _fly(
+    env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, seed: int | None, other: _OtherWorld | None = None
+) -> Episodes:
+    """One episode with action noise `std`; the expert is told the context of the `other` world, if there is one."""
     observation, _ = env.reset(seed=seed)
+    if other:
+        other.begin()
     _check_fit(env, expert)  # not before: what a class draws in `reset` need not be there earlier
     low, high = env.action_space.low, env.action_space.high
     steps: list[tuple[Any, ...]] = []
     ended = False
     while not ended:
-        wanted = expert.act(observation, _context(env))
+        wanted = expert.act(observation, other.context if other else _context(env))
         if wanted.shape != low.shape:
             raise ValueError(f"the expert answered an array of shape {wanted.shape}, an action of {env.spec.id} has {low.shape}")
         action = np.clip(wanted + std * rng.standard_normal(wanted.shape), low, high).astype(np.float32)
         following, reward, terminal, timeout, info = env.step(action)
+        if other:
+            other.follow(action)
         steps.append((observation, action, reward, terminal, timeout, std, info.get("context")))
         observation, ended = following, terminal or timeout
     *columns, contexts = zip(*steps, strict=True)
@@ -121,12 +168,16 @@ def data_card(job: Job, expert: Expert, episodes: Episodes, failed: np.ndarray, 
         "returns": returns_summary(returns, failed),
         "expert": expert.card,
     }
+    flown_blind, played = job.flown_blind(), job.played()
+
+    def summary(which: np.ndarray) -> dict[str, Any]:
+        return {"episodes": int(which.sum()), "returns": returns_summary(returns[which], failed[which]) if which.any() else None}
+
     if blind:
-        flown_blind = job.flown_blind()
-        card["blind"] = {"share": job.blind, "expert": blind.card}
-        for name, which in (("flown_blind", flown_blind), ("flown_seeing", ~flown_blind)):
-            summary = returns_summary(returns[which], failed[which]) if which.any() else None
-            card["blind"][name] = {"episodes": int(which.sum()), "returns": summary}
+        card["blind"] = {"share": job.blind, "expert": blind.card, "flown_blind": summary(flown_blind)}
+        card["blind"]["flown_seeing"] = summary(~flown_blind & ~played)
+    if job.play:
+        card["play"] = {"share": job.play, "played": summary(played), "demonstrated": summary(~played)}
     return card | {"versions": {name: version(name) for name in ("ada-diffuser", "gymnasium", "h5py", "mujoco", "numpy")}}
 
 

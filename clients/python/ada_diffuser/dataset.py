@@ -26,6 +26,7 @@ class Episodes:
         action_noise: (N,), float32; standard deviation of the episode's action noise.
         context: (N, context), float32; what was hidden while the action was executed; None where the environment tells none.
         blind: (N,), bool; whether the episode was flown without sight of the context; None where none was meant to be.
+        play: (N,), bool; whether it shows what comes of actions and is nothing to imitate; None where all is to be imitated.
     """
 
     observations: np.ndarray
@@ -36,6 +37,7 @@ class Episodes:
     action_noise: np.ndarray
     context: np.ndarray | None = None
     blind: np.ndarray | None = None
+    play: np.ndarray | None = None
 
     def returns(self) -> np.ndarray:
         """Undiscounted return of each episode, shape (episodes,), float64."""
@@ -58,9 +60,10 @@ _PATHS = {
     "context": "infos/context",
     "action_noise": "infos/action_noise",
     "blind": "infos/blind",
+    "play": "infos/play",
 }
 """Field of `Episodes` -> path in the file, in the order of writing."""
-_OPTIONAL = ("context", "blind")
+_OPTIONAL = ("context", "blind", "play")
 
 
 def save_episodes(episodes: Episodes, path: Path) -> str:

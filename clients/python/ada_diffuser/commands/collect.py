@@ -33,7 +33,11 @@ bytes.
 
 --blind S has a share S of the episodes, drawn by the seed, flown by an expert that does not see the context: policies searched
 for without it and kept as X.blind.npz, or the formula with the context's mean, where the class says what that is (`mean_context`).
-infos/blind tells those episodes, the card has the returns of both kinds."""
+infos/blind tells those episodes, the card has the returns of both kinds.
+
+--play S has a share S of the episodes flown by the expert while it is told the context of another world, drawn as the true one is. Its
+actions then say nothing of the true context, so that what comes of them does: data to find what is hidden in, and nothing to
+imitate. infos/play tells those episodes; ada-trainer has no planner imitate them."""
 
 _EXAMPLES = """\
 examples:
@@ -43,6 +47,7 @@ examples:
   ada-collect --env cheetah-vel-e --option 'targets=[0.5, 1.5, 2.5]' --out data/three-speeds.h5
   ada-collect --env cheetah-wind-s --expert data/cheetah-wind-s.expert.npz --seed 7 --out data/more.h5
   ada-collect --env hopper-gravity-e --blind 0.5 --action-noise 0.1,0.2 --out data/mixed.h5
+  ada-collect --env cheetah-gale-s --play 0.75 --episodes 1200 --out data/gale.h5
   ada-collect --env my_module:Mine-v0 --expert my_module:policy --out data/mine.h5
 """
 
@@ -93,6 +98,9 @@ def _parser() -> argparse.ArgumentParser:
     expert.add_argument(
         "--blind", type=float, default=0.0, metavar="SHARE", help="share of the episodes flown without sight of the context (default 0)"
     )
+    expert.add_argument(
+        "--play", type=float, default=0.0, metavar="SHARE", help="share of the episodes flown under a false context (default 0)"
+    )
     expert.add_argument("--blind-expert", metavar="E", help="fly this one there; as --expert")
     expert.add_argument("--expert-seed", type=int, default=0, metavar="N", help="of the searches (default 0)")
     expert.add_argument(
@@ -113,6 +121,10 @@ def _check_arguments(args: argparse.Namespace) -> None:
             raise ValueError(f"--{flag.replace('_', '-')} must be at least {least}")
     if not 0.0 <= args.blind <= 1.0:
         raise ValueError(f"--blind must be a share, 0 to 1, not {args.blind:g}")
+    if not 0.0 <= args.play < 1.0:
+        raise ValueError(f"--play must be a share below 1, not {args.play:g}: a planner needs something to imitate")
+    if args.blind + args.play > 1.0:
+        raise ValueError(f"--blind {args.blind:g} and --play {args.play:g} are more than all episodes")
     if args.blind_expert and not args.blind:
         raise ValueError("--blind-expert flies no episode without --blind")
     check_output("--out", args.out, ".h5", ".hdf5")
@@ -127,7 +139,7 @@ def _plan(args: argparse.Namespace) -> Job:
     env = environments.make(args.env, episode_steps=args.episode_steps, **options)
     noise = _noise(args.action_noise) if args.action_noise else environments.action_noise(env)
     env_id = args.env if ":" in args.env else env.spec.id
-    return Job(env_id, options, args.episodes, noise, args.seed, args.episode_steps, args.blind)
+    return Job(env_id, options, args.episodes, noise, args.seed, args.episode_steps, args.blind, args.play)
 
 
 def _value(text: str) -> Any:
