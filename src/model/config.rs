@@ -50,6 +50,14 @@ pub struct Trained {
     pub missing: Missing,
     /// Whether it included the refinement that zig-zag does (section 4.3 of the paper).
     pub refined: bool,
+    /// Whether histories crossed from one episode into the next, with a step between of which nothing is known, so that a session may keep
+    /// its own.
+    #[serde(default, skip_serializing_if = "is_off")]
+    pub sessions: bool,
+}
+
+fn is_off(flag: &bool) -> bool {
+    !flag
 }
 
 /// What a session gets that asks for nothing.
@@ -97,7 +105,7 @@ impl Default for Restart {
 }
 
 impl ModelConfig {
-    /// Plain units (no normalization, actions in [-1, 1]), every gap and chunk trained, and defaults for everything but the sizes that must
+    /// Plain units (no normalization, actions in [-1, 1]), every gap, chunk and border trained, and defaults for everything but the sizes that must
     /// be said: where tests, benches and examples start.
     pub fn plain(layout: Layout, latent: Option<GruLatent>, backbone: Backbone) -> Self {
         let plan = Diffusion { horizon: 8, obs_horizon: 1, level_max: 40, schedule: Schedule::Ladder, backbone, clip: 5.0 };
@@ -110,6 +118,7 @@ impl ModelConfig {
                 sub_steps: vec![1],
                 missing: Missing { state: true, action: true, reward: true },
                 refined: true,
+                sessions: true,
             },
             defaults: Defaults { sampler: SamplerOptions::default(), restart: Restart::default() },
         }

@@ -238,7 +238,9 @@ impl Service {
         check_request_id(&request_id)?;
         let session = self.session(&session_id)?;
         let now = Instant::now();
-        let renew = |episode: &Episode| session.agent.reset(episode, seed.unwrap_or_else(draw_seed), keep_history);
+        let renew = |episode: &Episode| {
+            session.agent.reset(episode, seed.unwrap_or_else(draw_seed), keep_history).map_err(ServiceError::from_agent)
+        };
         session.reset(renew, episode, request_id, now)?;
         Ok(session.summary(now))
     }

@@ -143,7 +143,7 @@ impl Crank<'_> {
         let (task, stage) = (self.task, &self.task.recipe.stages[learner.position.stage]);
         let Some(latent) = learner.networks.latent.as_ref().filter(|_| stage.identifies()) else { return Ok(true) };
         let held_out = Objective::new(task, learner.position.stage).held_out(&learner.networks)?;
-        let tells = task.split.train[0].context_dim > 0;
+        let tells = task.split.episodes.train[0].context_dim > 0;
         let context = tells.then(|| -> Result<_> { Ok((gate::probe(task, latent)?, gate::held_by_tokens(task)?)) }).transpose()?;
         let beside_baseline = latent.baseline.is_some();
         self.log.say(&sentence(&Found { held_out: &held_out, beside_baseline, looks: task.looks(), context }));

@@ -5,6 +5,7 @@
 
 use super::{
     Task,
+    dataset::Sides,
     probe::{Held, Subjects, held, latent_probe, places, probed},
     recipe::stages::Gate,
     ridge::Table,
@@ -37,7 +38,8 @@ impl Probed {
 /// # Errors
 /// If the data have no context, or a tensor operation fails.
 pub fn probe(task: &Task, latent: &LatentModel) -> Result<Probed> {
-    let subjects = subjects(task);
+    let episodes = episodes(task);
+    let subjects = subjects(&episodes);
     let error = |evidence| -> Result<f64> { Ok(latent_probe(latent, &subjects, evidence, task.looks(), &[0])?[0].errors.whole) };
     let successor_state = probed(latent).contains(&Evidence::SuccessorState).then(|| error(Evidence::SuccessorState)).transpose()?;
     Ok(Probed { filter: error(Evidence::Filter)?, successor_state })
@@ -48,11 +50,16 @@ pub fn probe(task: &Task, latent: &LatentModel) -> Result<Probed> {
 /// # Errors
 /// If an episode cannot be read.
 pub fn held_by_tokens(task: &Task) -> Result<Held> {
-    Ok(held(&subjects(task), task.looks())?)
+    Ok(held(&subjects(&episodes(task)), task.looks())?)
 }
 
-fn subjects(task: &Task) -> Subjects<'_> {
-    Subjects { train: &task.split.train, held_out: &task.split.held_out, rows_max: ROWS }
+/// What the latent is learned from is what it is judged on.
+fn episodes(task: &Task) -> Sides {
+    task.split.episodes.only(task.recipe.losses.elbo.as_ref().map(|loss| loss.episodes).unwrap_or_default())
+}
+
+fn subjects(Sides { train, held_out }: &Sides) -> Subjects<'_> {
+    Subjects { train, held_out, rows_max: ROWS }
 }
 
 /// Whether the contexts that the gate holds the latent against differ at all: an error in units of their variance needs one.
@@ -60,7 +67,7 @@ fn subjects(task: &Task) -> Subjects<'_> {
 /// # Errors
 /// If rows are kept in a file and it cannot be read.
 pub fn contexts_vary(task: &Task) -> Result<bool> {
-    let episodes = &task.split.held_out;
+    let episodes = &episodes(task).held_out;
     let mut truth = Table::new(episodes.first().map_or(0, |episode| episode.context_dim));
     for (episode, t) in places(episodes, ROWS).into_iter().filter(|(_, t)| *t >= task.config.method.latent.block_len()) {
         truth.values.extend(episodes[episode].context(t)?.iter().map(|value| f64::from(*value)));

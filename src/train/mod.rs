@@ -29,11 +29,16 @@ pub mod tensorboard;
 #[cfg(test)]
 mod tests;
 
-use crate::model::{checkpoint::is_name, config::ModelConfig, method::Looks, normalizer::Affine};
+use crate::model::{
+    checkpoint::is_name,
+    config::{ModelConfig, Trained},
+    method::Looks,
+    normalizer::Affine,
+};
 use anyhow::{Context, Result, ensure};
 use crank::Crank;
 use dataset::{
-    Episode, Split, UnitsFrom, hdf5,
+    Episode, Sides, Split, UnitsFrom, Which, hdf5,
     room::Room,
     units::{self, ActionColumn},
 };
@@ -115,10 +120,13 @@ impl Task {
         );
         let (layout, notes, dataset_digest) = (dataset.layout(), std::mem::take(&mut dataset.notes), dataset.digest.clone());
         let (split, action_columns) = dataset.split(UnitsFrom::Data(&recipe.actions))?;
-        let config = ModelConfig { units: split.units.clone(), ..recipe.config(layout) };
+        enough(&recipe, &split.episodes)?;
+        let sessions = split.episodes.train.iter().any(|episode| episode.reach() > 0);
+        let plain = recipe.config(layout);
+        let config = ModelConfig { units: split.units.clone(), trained: Trained { sessions, ..plain.trained.clone() }, ..plain };
         // The recipe was checked with plain units; now the data's are known.
         config.check().with_context(|| format!("data set {} makes no model", recipe.data.display()))?;
-        let context_units = units_of_context(&split.train, tells)?;
+        let context_units = units_of_context(&split.episodes.train, tells)?;
         let task = Self { context_units, recipe, split, action_columns, dataset_digest, config, notes };
         if let Some(key) = task.recipe.probe_key() {
             ensure!(
@@ -135,6 +143,27 @@ impl Task {
     pub fn looks(&self) -> Looks {
         self.config.method.latent.gru().map_or(Looks::Block(0), |gru| gru.looks)
     }
+}
+
+/// Whether each loss has episodes to learn from, and others to be measured on.
+fn enough(recipe: &Recipe, episodes: &Sides) -> Result<()> {
+    let asked = [
+        recipe.losses.context_free.as_ref().map(|loss| ("losses.context_free.episodes", loss.episodes)),
+        recipe.losses.elbo.as_ref().map(|loss| ("losses.elbo.episodes", loss.episodes)),
+        Some(("losses.denoise", Which::Demonstrations)),
+    ];
+    for (key, which) in asked.into_iter().flatten() {
+        let Sides { train, held_out } = episodes.only(which);
+        ensure!(
+            !train.is_empty() && !held_out.is_empty(),
+            "recipe: `{key}`: of {which} in {} {} are for training and {} held out, at least one each is needed; `infos/play` says which \
+             episodes are play (ada-collect --play)",
+            recipe.data.display(),
+            train.len(),
+            held_out.len()
+        );
+    }
+    Ok(())
 }
 
 /// Mean and standard deviation of each of the columns over these episodes.
@@ -167,8 +196,10 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     let stages = task.recipe.stages.iter().map(|stage| stage.name.clone()).collect();
     let log = Log::open(&dir, stages, &learner.position, options.clock)?;
     task.notes.iter().for_each(|note| log.say(note));
-    let (train, held_out) = (task.split.train.len(), task.split.held_out.len());
-    log.say(&format!("{}: {train} episodes to train on, {held_out} held out", task.recipe.data.display()));
+    let Sides { train, held_out } = &task.split.episodes;
+    let play = train.iter().chain(held_out).filter(|episode| episode.play).count();
+    let of_play = if play > 0 { format!("; {play} of them are play, which is not imitated") } else { String::new() };
+    log.say(&format!("{}: {} episodes to train on, {} held out{of_play}", task.recipe.data.display(), train.len(), held_out.len()));
     log.say(&format!("actions: {}", units::summary(&task.recipe.actions, &task.action_columns)));
     for (index, notable) in task.action_columns.iter().map(ActionColumn::notable).enumerate() {
         notable.into_iter().for_each(|notable| log.say(&format!("warning: actions, column {index}: {notable}")));

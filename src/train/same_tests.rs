@@ -3,7 +3,7 @@
 
 use super::{
     dataset::{
-        Episode,
+        Episode, Span,
         hidden::Hide,
         window::{Levels, Places, WindowShape, windows},
     },
@@ -70,11 +70,15 @@ fn agent(config: &ModelConfig) -> Agent {
     Agent::new(config.clone(), networks(&Params::loaded(tensors)), "same".into())
 }
 
-/// Episodes of numbers that no two places share, actions within their bounds.
-fn episodes() -> Vec<Episode> {
-    let mut rng = Philox::new(3);
+/// Episodes of numbers that no two places share, actions within their bounds; each follows one of so many steps, if any.
+fn episodes(before: usize) -> Vec<Episode> {
+    let (mut rng, all) = (Philox::new(3), before + STEPS);
     let mut numbers = |count: usize, scale: f32| (0..count).map(|_| scale * (2.0 * rng.uniform() - 1.0)).collect::<Vec<f32>>();
-    (0..3).map(|_| Episode::of(LAYOUT, [numbers(STEPS * 3, 2.0), numbers(STEPS * 2, 1.0), numbers(STEPS, 1.0), Vec::new()])).collect()
+    let mut episode = || {
+        let columns = [numbers(all * 3, 2.0), numbers(all * 2, 1.0), numbers(all, 1.0), Vec::new()];
+        Episode::among(LAYOUT, columns, Span { rows: before..all, play: false, before: (before > 0).then_some(0..before) })
+    };
+    (0..3).map(|_| episode()).collect()
 }
 
 fn numbers(tensor: &candle_core::Tensor, row: usize) -> Vec<f32> {
@@ -90,15 +94,21 @@ fn place(episodes: &[Episode], batch: &WindowBatch, row: usize) -> (usize, usize
 
 /// The past that this row of the batch shows, as a client tells it: the last `imagined` steps are not told, they were given out.
 fn told(batch: &WindowBatch, row: usize, steps: usize, imagined: usize) -> Vec<Executed> {
+    let len = history_len(batch, row);
+    executed(batch, row, len - steps.min(len)..len - imagined)
+}
+
+/// What a client tells of these steps of the history.
+fn executed(batch: &WindowBatch, row: usize, steps: std::ops::Range<usize>) -> Vec<Executed> {
     let tokens = &batch.history;
     let (state, action, reward) = (numbers(&tokens.state, row), numbers(&tokens.action, row), numbers(&tokens.reward, row));
-    let (present, len) = (numbers(&tokens.present, row), history_len(batch, row));
+    let present = numbers(&tokens.present, row);
     let step = |i: usize| Executed {
         state: (present[3 * i] == 1.0).then(|| state[3 * i..3 * i + 3].to_vec()),
         action: (present[3 * i + 1] == 1.0).then(|| action[2 * i..2 * i + 2].to_vec()),
         reward: (present[3 * i + 2] == 1.0).then(|| reward[i]),
     };
-    (len - steps.min(len)..len - imagined).map(step).collect()
+    steps.map(step).collect()
 }
 
 fn history_len(batch: &WindowBatch, row: usize) -> usize {
@@ -106,7 +116,12 @@ fn history_len(batch: &WindowBatch, row: usize) -> usize {
 }
 
 fn check(config: &ModelConfig, hide: Hide) {
-    let (agent, episodes, plan) = (agent(config), episodes(), &config.method.plan);
+    check_after(0, config, hide);
+}
+
+/// The same of episodes that follow others of so many steps.
+fn check_after(before: usize, config: &ModelConfig, hide: Hide) {
+    let (agent, episodes, plan) = (agent(config), episodes(before), &config.method.plan);
     let (sampler, latents_free) = (&config.defaults.sampler, config.method.latent.gru().is_none());
     let shape = WindowShape {
         batch: BATCH,
@@ -145,8 +160,7 @@ fn check(config: &ModelConfig, hide: Hide) {
 
 fn assert_same(agent: &Agent, one: &WindowBatch, [trained, ready]: [&[Vec<f32>; 4]; 2], start: usize) {
     let (imagined, Standing::Row(row)) = (one.imagined[0], one.at[0].clone()) else { panic!("a row") };
-    let sampler = &agent.config().defaults.sampler;
-    let episode = agent.open(1, sampler).unwrap();
+    let episode = begun(agent, one, start);
     let given: Vec<f32> = match imagined {
         0 => Vec::new(),
         steps => {
@@ -161,6 +175,34 @@ fn assert_same(agent: &Agent, one: &WindowBatch, [trained, ready]: [&[Vec<f32>; 
     for (what, (trained, served)) in ["x", "levels", "latents", "history"].iter().zip(trained.iter().zip(&served)) {
         let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
         assert_eq!(bits(trained), bits(served), "{what} in row {}, {imagined} imagined, from step {start}", row);
+    }
+}
+
+/// A session at the start of the episode in which the window begins at step `start`: fresh, or reset after the episode before, of which the
+/// last token of the history that lies before this episode is the border.
+fn begun(agent: &Agent, one: &WindowBatch, start: usize) -> crate::model::agent::Episode {
+    let fresh = agent.open(1, &agent.config().defaults.sampler).unwrap();
+    let earlier = history_len(one, 0).saturating_sub(start);
+    let shows_any = numbers(&one.history.present, 0)[..3 * earlier].iter().any(|flag| *flag == 1.0);
+    if earlier == 0 || !(shows_any || one.history_lens.is_some()) {
+        return fresh;
+    }
+    let last = Observation { state: vec![0.0; 3], executed: executed(one, 0, 0..earlier - 1), nothing_executed: false };
+    let (lived, _) = agent.act(&fresh, &last).unwrap();
+    agent.reset(&lived, 1, true).unwrap()
+}
+
+#[test]
+fn sessions() {
+    let (ladder, hide) = (Schedule::Ladder, Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    for (looks, future, obs_horizon) in
+        [(Looks::Block(6), Future::Prior, 3), (Looks::Running, Future::Prior, 1), (Looks::Running, Future::Held, 3)]
+    {
+        let config = config(Some((looks, future)), ladder, obs_horizon, 1);
+        check_after(9, &config, Hide::NOTHING);
+        check_after(9, &beside_baseline(config.clone()), hide);
+        // Shorter than the block that is looked at.
+        check_after(3, &config, hide);
     }
 }
 

@@ -1,7 +1,9 @@
 //! From a learner to a checkpoint: averaged weights, the yardstick of latent jumps, and what was measured.
 
 use super::{
-    Task, gate,
+    Task,
+    dataset::Which,
+    gate,
     learner::Learner,
     losses::denoise::DenoiseLoss,
     probe::{latent_means, places, spread},
@@ -69,7 +71,7 @@ pub fn product(task: &Task, learner: &Learner) -> Result<Product> {
 
 /// How far the prior's mean of c_tau moves over the training data: what the sampler holds a latent jump against.
 fn latent_spread(task: &Task, latent: &LatentModel) -> Result<f32> {
-    let episodes = &task.split.train;
+    let episodes = &task.split.episodes.only(Which::Demonstrations).train;
     let means = latent_means(latent, episodes, &places(episodes, SPREAD_ROWS), Evidence::Filter, task.looks())?;
     Ok(spread(&means) as f32)
 }
@@ -77,7 +79,7 @@ fn latent_spread(task: &Task, latent: &LatentModel) -> Result<f32> {
 fn metrics(task: &Task, learner: &Learner, networks: &Networks, errors: &[f64]) -> Result<Value> {
     let round = |value: f64| (value * 1e5).round() / 1e5;
     let probe = match &networks.latent {
-        Some(latent) if task.split.train[0].context_dim > 0 => {
+        Some(latent) if task.split.episodes.train[0].context_dim > 0 => {
             let result = gate::probe(task, latent)?;
             json!({"filter": round(result.filter), "successor_state": result.successor_state.map(round)})
         }

@@ -380,7 +380,7 @@ fn split(file: &str) -> Split {
 /// States, actions, rewards and context of all episodes, as the networks get them.
 fn numbers(split: &Split) -> Vec<f32> {
     let mut all = Vec::new();
-    for episode in split.train.iter().chain(&split.held_out) {
+    for episode in split.episodes.train.iter().chain(&split.episodes.held_out) {
         for t in 0..episode.len() {
             all.extend(episode.state(t).unwrap().iter().chain(&*episode.action(t).unwrap()));
             all.push(episode.reward(t).unwrap());
@@ -395,16 +395,17 @@ fn numbers(split: &Split) -> Vec<f32> {
 fn data_sets_are_read_and_split() {
     let [single, double] = ["data_good", "data_f64"].map(split);
     assert_eq!(numbers(&single), numbers(&double));
-    assert_eq!((single.train.len(), single.held_out.len()), (10, 2));
-    for episode in single.train.iter().chain(&single.held_out) {
+    assert_eq!((single.episodes.train.len(), single.episodes.held_out.len()), (10, 2));
+    for episode in single.episodes.train.iter().chain(&single.episodes.held_out) {
         assert_eq!((episode.len(), episode.context_dim), (24, 1));
         assert!((0..24).all(|t| episode.context(t).unwrap() == episode.context(0).unwrap()));
     }
-    let states: Vec<f32> = single.train.iter().flat_map(|episode| (0..24).map(|t| episode.state(t).unwrap()[0])).collect();
+    let states: Vec<f32> = single.episodes.train.iter().flat_map(|episode| (0..24).map(|t| episode.state(t).unwrap()[0])).collect();
     let mean = states.iter().sum::<f32>() / states.len() as f32;
     let var = states.iter().map(|state| (state - mean).powi(2)).sum::<f32>() / states.len() as f32;
     assert!(mean.abs() < 1e-5 && (var - 1.0).abs() < 1e-4, "{mean} {var}");
-    let actions: Vec<f32> = single.train.iter().flat_map(|episode| (0..24).flat_map(|t| episode.action(t).unwrap().into_owned())).collect();
+    let actions: Vec<f32> =
+        single.episodes.train.iter().flat_map(|episode| (0..24).flat_map(|t| episode.action(t).unwrap().into_owned())).collect();
     assert!(actions.iter().all(|action| (-1.0..=1.0).contains(action)) && actions.contains(&1.0) && actions.contains(&-1.0));
     let digests =
         ["data_good", "data_f64"].map(|file| hdf5::read(Path::new(&format!("tests/golden/{file}.h5")), &Room::default()).unwrap());
@@ -437,15 +438,15 @@ fn short_episodes_are_left_out_and_counted() {
     let read = || hdf5::read(Path::new("tests/golden/data_good.h5"), &Room::default()).unwrap();
     let mut dataset = read();
     assert_eq!(dataset.notes, Vec::<String>::new());
-    dataset.episodes[4].end -= 20;
-    dataset.episodes[9].start += 8;
+    dataset.episodes[4].rows.end -= 20;
+    dataset.episodes[9].rows.start += 8;
     dataset.leave_out_shorter(17, "`losses.elbo.length` + 1").unwrap();
     assert_eq!(dataset.episodes.len(), 10);
     assert!(dataset.notes[0].contains("left out 2 of 12 episodes shorter than 17 steps (`losses.elbo.length` + 1)"), "{:?}", dataset.notes);
     let split = dataset.split(UnitsFrom::Data(&ActionsConfig::default())).unwrap().0;
-    assert_eq!((split.train.len(), split.held_out.len()), (9, 1));
+    assert_eq!((split.episodes.train.len(), split.episodes.held_out.len()), (9, 1));
     let mut dataset = read();
-    dataset.episodes[1..].iter_mut().for_each(|span| span.end -= 23);
+    dataset.episodes[1..].iter_mut().for_each(|span| span.rows.end -= 23);
     let error = dataset.leave_out_shorter(2, "`x`").unwrap_err().to_string();
     assert!(error.contains("1 of 12 episode(s) have the 2 steps that `x` asks for, the longest has 24"), "{error}");
 }

@@ -379,7 +379,8 @@ class Session:
     def reset(self, seed: int | None = None, *, keep_history: bool = False) -> None:
         """A new episode: committed step 0 again. Without `seed` the server draws one.
 
-        With `keep_history` the latent goes on looking back on the old episode, for a context that outlasts episodes.
+        With `keep_history` the latent goes on looking back on the old episode, for a context that outlasts episodes; refused where the
+        model's `trained.sessions` is false.
         """
         summary = self._client._reset(self.session_id, seed, keep_history, self._episode)
         self.seed, self._committed_step, self._episode = summary.seed, summary.committed_step, summary.episode

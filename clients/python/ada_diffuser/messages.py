@@ -220,6 +220,8 @@ class Trained:
     #: Sub-steps per rung, ascending.
     sub_steps: tuple[int, ...]
     missing: Missing
+    #: Whether histories crossed from one episode into the next, so that a reset may keep them.
+    sessions: bool = False
 
 
 @dataclass(frozen=True, eq=False)

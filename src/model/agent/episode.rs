@@ -60,17 +60,15 @@ impl Episode {
         Self { seed, options, time: 0, history, memory, unread: 0, planned: None, window: None, latent: None }
     }
 
-    /// See [`super::Agent::reset`]; with `border`, a token of which nothing is known stands between the old episode and the new one.
-    pub(super) fn reset(&self, seed: u64, keep_history: bool, border: bool) -> Self {
+    /// See [`super::Agent::reset`]. A token of which nothing is known stands between the old episode and the new one: from the last state of
+    /// the one nobody arrives at the first of the other. What came of the old one's last act nobody has told.
+    pub(super) fn reset(&self, seed: u64, keep_history: bool) -> Self {
         let mut fresh = Self::new(seed, self.options.clone(), self.memory.len());
         if keep_history {
             fresh.history.clone_from(&self.history);
             fresh.memory.clone_from(&self.memory);
-            fresh.unread = self.unread;
-            if border {
-                fresh.history.push_back(Token::default());
-                fresh.unread += usize::from(!fresh.memory.is_empty());
-            }
+            fresh.history.push_back(Token::default());
+            fresh.unread = self.unread + usize::from(!fresh.memory.is_empty());
         }
         fresh
     }

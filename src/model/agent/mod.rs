@@ -88,9 +88,14 @@ impl Agent {
 
     /// A new episode with the options of an old one. With `keep_history` the latent goes on looking back on the old one's last steps,
     /// as a context that outlasts episodes needs.
-    pub fn reset(&self, episode: &Episode, seed: u64, keep_history: bool) -> Episode {
-        // From the last state of an episode nobody arrives at the first of another.
-        episode.reset(seed, keep_history, self.config.method.latent.baseline().is_some())
+    ///
+    /// # Errors
+    /// [`AgentError::HistoryNotKept`] if `keep_history` asks for what training never saw.
+    pub fn reset(&self, episode: &Episode, seed: u64, keep_history: bool) -> Result<Episode, AgentError> {
+        if keep_history && !self.config.trained.sessions {
+            return Err(AgentError::HistoryNotKept);
+        }
+        Ok(episode.reset(seed, keep_history))
     }
 
     /// Checks the observation and begins an act on a copy of the episode; no network evaluation yet.

@@ -113,6 +113,12 @@ pub enum AgentError {
         /// What is wrong and what is allowed.
         reason: String,
     },
+    /// A history is to be kept that training never saw cross into another episode.
+    #[error(
+        "is true, but this checkpoint was trained on episodes one by one: train on a data set with `infos/session`, or begin each episode \
+         without a history"
+    )]
+    HistoryNotKept,
     /// The network answered with NaN or infinity.
     #[error("the network's output is not finite")]
     NonFinite,

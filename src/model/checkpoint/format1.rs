@@ -77,6 +77,7 @@ impl From<ConfigV1> for ModelConfig {
                 sub_steps: with(old.sub_steps_trained, old.sampler.sub_steps),
                 missing: old.missing_trained,
                 refined: old.refined,
+                sessions: false,
             },
             defaults: Defaults { sampler: old.sampler, restart: old.restart },
         }

@@ -216,11 +216,12 @@ pub fn model(model: &Model) -> pb::Model {
 }
 
 fn trained(trained: &Trained) -> pb::Trained {
-    let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward }, refined: _ } = trained;
+    let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward }, refined: _, sessions } = trained;
     let lengths = |lengths: &[usize]| lengths.iter().map(|length| *length as u32).collect();
     pb::Trained {
         action_horizons: lengths(action_horizons),
         sub_steps: lengths(sub_steps),
         missing: Some(pb::Missing { state: *state, action: *action, reward: *reward }),
+        sessions: *sessions,
     }
 }

@@ -210,6 +210,8 @@ pub struct TrainedAnswer {
     action_horizons: Vec<usize>,
     sub_steps: Vec<usize>,
     missing: MissingAnswer,
+    /// Whether histories crossed from one episode into the next, so that a reset may keep them.
+    sessions: bool,
 }
 
 /// Parts of an executed step that may be missing without being guessed.
@@ -222,8 +224,8 @@ pub struct MissingAnswer {
 
 impl From<Trained> for TrainedAnswer {
     fn from(trained: Trained) -> Self {
-        let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward }, refined: _ } = trained;
-        Self { action_horizons, sub_steps, missing: MissingAnswer { state, action, reward } }
+        let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward }, refined: _, sessions } = trained;
+        Self { action_horizons, sub_steps, missing: MissingAnswer { state, action, reward }, sessions }
     }
 }
 

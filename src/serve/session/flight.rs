@@ -203,7 +203,7 @@ mod tests {
             });
             assert_eq!(late.is_some(), session.summary(Instant::now()).committed_step == 1);
             *if late.is_some() { &mut told } else { &mut silent } += 1;
-            session.reset(|_| episode.clone(), None, String::new(), Instant::now()).unwrap();
+            session.reset(|_| Ok(episode.clone()), None, String::new(), Instant::now()).unwrap();
         }
         assert!(told > 0 && silent > 0, "both orders occur: {told}, {silent}");
     }

@@ -275,10 +275,10 @@ impl Session {
     /// do so again: a copy that came late once undid 24 committed acts.
     ///
     /// # Errors
-    /// If the episode is over, while an act is in flight, or after the end.
+    /// If the episode is over, while an act is in flight, or after the end; and those of `renew`.
     pub fn reset(
         &self,
-        renew: impl FnOnce(&Episode) -> Episode,
+        renew: impl FnOnce(&Episode) -> Result<Episode, ServiceError>,
         ends: Option<u64>,
         request_id: String,
         now: Instant,
@@ -295,7 +295,7 @@ impl Session {
         if slot.flight.as_ref().is_some_and(|flight| flight.is_wanted()) {
             return Err(ServiceError::SessionBusy { committed: slot.committed.step });
         }
-        let episode = renew(&slot.committed.episode);
+        let episode = renew(&slot.committed.episode)?;
         self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
         slot.flight = None;
         slot.resets += 1;

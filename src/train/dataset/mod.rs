@@ -16,7 +16,8 @@ use crate::model::{
 };
 pub use rows::Episode;
 use rows::Fields;
-use std::{io, ops::Range, sync::Arc};
+use serde::{Deserialize, Serialize};
+use std::{fmt, io, ops::Range, sync::Arc};
 
 /// One episode in this many is held out.
 const HELD_OUT_EVERY: usize = 10;
@@ -77,18 +78,78 @@ pub struct Dataset {
     pub digest: String,
     /// All rows.
     pub fields: Fields,
-    /// Rows of each episode, in the order of the file.
-    pub episodes: Vec<Range<usize>>,
+    /// The episodes, in the order of the file.
+    pub episodes: Vec<Span>,
     /// What a person should know about it; goes into the log.
     pub notes: Vec<String>,
 }
 
+/// Where an episode lies, and what it is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Span {
+    /// Its rows.
+    pub rows: Range<usize>,
+    /// Whether it shows what comes of actions and is nothing to imitate.
+    pub play: bool,
+    /// The rows of the episode that it follows in its session, if there is one, but the last: a session is never told what came of an
+    /// episode's last act.
+    pub before: Option<Range<usize>>,
+}
+
+/// Which episodes are meant.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Which {
+    /// All of them.
+    #[default]
+    All,
+    /// Those to imitate: all but play.
+    Demonstrations,
+    /// Those that show what comes of actions which say nothing of the context (`infos/play`).
+    Play,
+}
+
+impl fmt::Display for Which {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::All => "all episodes",
+            Self::Demonstrations => "the episodes to imitate",
+            Self::Play => "the episodes of play",
+        })
+    }
+}
+
+impl Which {
+    fn holds(self, play: bool) -> bool {
+        match self {
+            Self::All => true,
+            Self::Demonstrations => !play,
+            Self::Play => play,
+        }
+    }
+}
+
+/// Episodes to train on, and others to measure on.
+#[derive(Clone, Debug)]
+pub struct Sides {
+    /// To train on.
+    pub train: Vec<Episode>,
+    /// To measure on.
+    pub held_out: Vec<Episode>,
+}
+
+impl Sides {
+    /// Those of them that are meant.
+    pub fn only(&self, which: Which) -> Self {
+        let meant = |episodes: &[Episode]| episodes.iter().filter(|episode| which.holds(episode.play)).cloned().collect();
+        Self { train: meant(&self.train), held_out: meant(&self.held_out) }
+    }
+}
+
 /// A data set ready for training, normalized units, with the map to them.
 pub struct Split {
-    /// Episodes to train on.
-    pub train: Vec<Episode>,
-    /// Episodes to measure on.
-    pub held_out: Vec<Episode>,
+    /// All episodes.
+    pub episodes: Sides,
     /// Their units, fitted on the training episodes; the latent's spread is told by training.
     pub units: Units,
 }
@@ -117,8 +178,8 @@ impl Dataset {
     /// # Errors
     /// If fewer than two are left.
     pub fn leave_out_shorter(&mut self, needed: usize, why: &str) -> Result<(), DatasetError> {
-        let (episodes, longest) = (self.episodes.len(), self.episodes.iter().map(Range::len).max().unwrap_or(0));
-        self.episodes.retain(|span| span.len() >= needed);
+        let (episodes, longest) = (self.episodes.len(), self.episodes.iter().map(|span| span.rows.len()).max().unwrap_or(0));
+        self.episodes.retain(|span| span.rows.len() >= needed);
         let kept = self.episodes.len();
         if kept < 2 {
             return Err(DatasetError::TooFew { path: self.path.clone(), kept, episodes, needed, why: why.into(), longest });
@@ -161,13 +222,13 @@ impl Dataset {
             rewards: rewards.normalized(units.normalizer.reward.clone(), None),
             context,
         });
-        let episodes = |spans: Vec<Range<usize>>| spans.into_iter().map(|span| Episode::new(&fields, span)).collect();
-        Ok((Split { train: episodes(train), held_out: episodes(held_out), units }, columns))
+        let episodes = |spans: Vec<Span>| spans.into_iter().map(|span| Episode::new(&fields, span)).collect();
+        Ok((Split { episodes: Sides { train: episodes(train), held_out: episodes(held_out) }, units }, columns))
     }
 
     /// Gaussian maps for states and rewards, those of [`units`] for actions; fitted on these episodes.
-    fn fit(&self, train: &[Range<usize>], wishes: &ActionsConfig) -> Result<(Units, Vec<ActionColumn>), DatasetError> {
-        let (fields, spans) = (&self.fields, || train.iter().cloned());
+    fn fit(&self, train: &[Span], wishes: &ActionsConfig) -> Result<(Units, Vec<ActionColumn>), DatasetError> {
+        let (fields, spans) = (&self.fields, || train.iter().map(|span| span.rows.clone()));
         let columns = units::fit(wishes, &self.path, fields.actions.width(), |visit| fields.actions.scan(spans(), visit))?;
         let maps = || -> io::Result<_> {
             let state = Affine::fit(fields.states.width(), |visit| fields.states.scan(spans(), visit))?;

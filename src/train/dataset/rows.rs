@@ -1,7 +1,7 @@
 //! The rows of a data set, in memory or, where they take more than that, in a file that is read piece by piece. Who draws from them
 //! cannot tell which: the same numbers come, bit for bit.
 
-use super::room::Room;
+use super::{Span, room::Room};
 use crate::model::{
     normalizer::{Affine, hold_within},
     trajectory::Layout,
@@ -197,49 +197,89 @@ impl Fields {
     }
 }
 
-/// One episode: consecutive rows.
+/// One episode: consecutive rows. Beyond its first step lies, in a session, the episode that it follows, and a border between them: a step of
+/// which nothing is known. So the steps before step 0 are -1, the border, and -2, -3, .., the last ones of that episode.
 #[derive(Clone, Debug)]
 pub struct Episode {
     /// Widths of states and actions.
     pub layout: Layout,
     /// Width of the context; 0 where the file has none.
     pub context_dim: usize,
+    /// Whether it shows what comes of actions and is nothing to imitate.
+    pub play: bool,
     fields: Arc<Fields>,
-    span: Range<usize>,
+    rows: Range<usize>,
+    before: Option<Range<usize>>,
 }
 
 impl Episode {
     /// The rows of `span`.
-    pub fn new(fields: &Arc<Fields>, span: Range<usize>) -> Self {
-        Self { layout: fields.layout(), context_dim: fields.context.width, fields: fields.clone(), span }
+    pub fn new(fields: &Arc<Fields>, Span { rows, play, before }: Span) -> Self {
+        Self { layout: fields.layout(), context_dim: fields.context.width, play, fields: fields.clone(), rows, before }
     }
 
     /// An episode of its own from states, actions, rewards and context.
     #[cfg(test)]
-    pub fn of(layout: Layout, [states, actions, rewards, context]: [Vec<f32>; 4]) -> Self {
-        let (len, context_dim) = (rewards.len(), context.len() / rewards.len());
+    pub fn of(layout: Layout, columns: [Vec<f32>; 4]) -> Self {
+        let all = columns[2].len();
+        Self::among(layout, columns, Span { rows: 0..all, play: false, before: None })
+    }
+
+    /// An episode among others, whose rows are those of the columns.
+    #[cfg(test)]
+    pub fn among(layout: Layout, [states, actions, rewards, context]: [Vec<f32>; 4], span: Span) -> Self {
+        let context_dim = context.len() / rewards.len();
         let fields = Fields {
             states: Field::in_memory(layout.state_dim, states),
             actions: Field::in_memory(layout.action_dim, actions),
             rewards: Field::in_memory(1, rewards),
             context: Field::in_memory(context_dim, context),
         };
-        Self::new(&Arc::new(fields), 0..len)
+        Self::new(&Arc::new(fields), span)
     }
 
     /// Number of steps.
     pub fn len(&self) -> usize {
-        self.span.len()
+        self.rows.len()
     }
 
     /// Whether there are no steps.
     pub fn is_empty(&self) -> bool {
-        self.span.is_empty()
+        self.rows.is_empty()
     }
 
-    fn row<'a>(&self, field: &'a Field, t: usize) -> io::Result<Cow<'a, [f32]>> {
+    /// How many steps lie before its first: the border and the episode that it follows.
+    pub fn reach(&self) -> usize {
+        self.before.as_ref().map_or(0, |before| 1 + before.len())
+    }
+
+    /// The same episode as the first of a session.
+    pub fn alone(&self) -> Self {
+        Self { before: None, ..self.clone() }
+    }
+
+    /// Where step t lies; none for a border, and where there is no such step.
+    fn row(&self, t: isize) -> Option<usize> {
+        match (usize::try_from(t), &self.before) {
+            (Ok(t), _) => Some(self.rows.start + t).filter(|row| *row < self.rows.end),
+            (Err(_), None) => None,
+            (Err(_), Some(before)) => before.end.checked_sub(t.unsigned_abs() - 1).filter(|row| before.contains(row)),
+        }
+    }
+
+    fn read<'a>(&self, field: &'a Field, t: usize) -> io::Result<Cow<'a, [f32]>> {
         assert!(t < self.len(), "a step outside of the episode: is a bug");
-        field.rows(self.span.start + t..self.span.start + t + 1)
+        field.rows(self.rows.start + t..self.rows.start + t + 1)
+    }
+
+    /// (s_t, a_t, r_t) of a step of this episode or of that before it; none for a border, and where there is no such step.
+    ///
+    /// # Errors
+    /// If rows are kept in a file and it cannot be read.
+    pub fn step(&self, t: isize) -> io::Result<Option<Step<'_>>> {
+        let Some(row) = self.row(t) else { return Ok(None) };
+        let Fields { states, actions, rewards, .. } = &*self.fields;
+        Ok(Some(Step { state: states.rows(row..row + 1)?, action: actions.rows(row..row + 1)?, reward: rewards.rows(row..row + 1)?[0] }))
     }
 
     /// s_t.
@@ -247,7 +287,7 @@ impl Episode {
     /// # Errors
     /// If rows are kept in a file and it cannot be read.
     pub fn state(&self, t: usize) -> io::Result<Cow<'_, [f32]>> {
-        self.row(&self.fields.states, t)
+        self.read(&self.fields.states, t)
     }
 
     /// a_t.
@@ -255,7 +295,7 @@ impl Episode {
     /// # Errors
     /// As of [`Self::state`].
     pub fn action(&self, t: usize) -> io::Result<Cow<'_, [f32]>> {
-        self.row(&self.fields.actions, t)
+        self.read(&self.fields.actions, t)
     }
 
     /// r_t.
@@ -263,7 +303,7 @@ impl Episode {
     /// # Errors
     /// As of [`Self::state`].
     pub fn reward(&self, t: usize) -> io::Result<f32> {
-        Ok(self.row(&self.fields.rewards, t)?[0])
+        Ok(self.read(&self.fields.rewards, t)?[0])
     }
 
     /// The context at t.
@@ -271,8 +311,18 @@ impl Episode {
     /// # Errors
     /// As of [`Self::state`].
     pub fn context(&self, t: usize) -> io::Result<Cow<'_, [f32]>> {
-        self.row(&self.fields.context, t)
+        self.read(&self.fields.context, t)
     }
+}
+
+/// One step of an episode.
+pub struct Step<'a> {
+    /// s_t.
+    pub state: Cow<'a, [f32]>,
+    /// a_t.
+    pub action: Cow<'a, [f32]>,
+    /// r_t.
+    pub reward: f32,
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Batches: blocks for the ELBO and windows to denoise, cut from episodes at drawn places.
 
-use super::{Episode, hidden::Hide};
+use super::{Episode, hidden::Hide, rows::Step};
 use crate::model::{
     diffusion::{
         refine::{Standing, WindowBatch},
@@ -30,19 +30,30 @@ impl TokenRows {
         Self { layout, state: Vec::new(), action: Vec::new(), reward: Vec::new(), present: Vec::new() }
     }
 
-    /// Appends x_t of an episode, wholly absent where `t` lies outside of it.
+    /// Appends x_t of an episode, wholly absent where there is no such step.
     ///
     /// # Errors
     /// If the episode cannot be read.
     pub fn push(&mut self, episode: &Episode, t: isize, seen: Seen) -> io::Result<()> {
-        let inside = usize::try_from(t).ok().filter(|t| *t < episode.len());
-        let flags = if inside.is_some() { seen.flags() } else { Seen::NOTHING.flags() };
+        let Some(Step { state, action, reward }) = episode.step(t)? else {
+            self.push_absent();
+            return Ok(());
+        };
+        let flags = seen.flags();
         self.present.extend(flags);
-        let t = inside.unwrap_or(0);
-        self.state.extend(episode.state(t)?.iter().map(|value| value * flags[0]));
-        self.action.extend(episode.action(t)?.iter().map(|value| value * flags[1]));
-        self.reward.push(episode.reward(t)? * flags[2]);
+        self.state.extend(state.iter().map(|value| value * flags[0]));
+        self.action.extend(action.iter().map(|value| value * flags[1]));
+        self.reward.push(reward * flags[2]);
         Ok(())
+    }
+
+    /// Appends a token of which nothing is known.
+    pub fn push_absent(&mut self) {
+        let Layout { state_dim, action_dim } = self.layout;
+        self.present.extend(Seen::NOTHING.flags());
+        self.state.extend(std::iter::repeat_n(0.0, state_dim));
+        self.action.extend(std::iter::repeat_n(0.0, action_dim));
+        self.reward.push(0.0);
     }
 
     /// `batch` rows of `len` tokens each.
@@ -66,27 +77,33 @@ impl TokenRows {
 pub struct Places {
     /// Places up to and with each episode.
     ends: Vec<usize>,
-    before: usize,
+    /// How many steps before its own first a piece may begin, in each episode.
+    before: Vec<usize>,
 }
 
 impl Places {
     /// From `before` steps before each episode's start up to the last place where `len` steps still fit.
     pub fn new(episodes: &[Episode], before: usize, len: usize) -> Self {
-        let count = |episode: &Episode| (episode.len() + before + 1).saturating_sub(len);
-        let ends = episodes.iter().scan(0, |sum, episode| {
-            *sum += count(episode);
-            Some(*sum)
-        });
-        Self { ends: ends.collect(), before }
+        Self::counted(episodes.iter().map(|episode| (before, (episode.len() + before + 1).saturating_sub(len))))
     }
 
-    /// Only the start of each episode that has room for `len` steps.
+    /// Only the start of each episode that has room for `len` steps; where it follows another, also up to half of these before it.
     pub fn starts(episodes: &[Episode], len: usize) -> Self {
-        let ends = episodes.iter().scan(0, |sum, episode| {
-            *sum += usize::from(episode.len() >= len);
-            Some(*sum)
-        });
-        Self { ends: ends.collect(), before: 0 }
+        Self::counted(episodes.iter().map(|episode| {
+            let before = episode.reach().min(len / 2);
+            (before, if episode.len() >= len { before + 1 } else { 0 })
+        }))
+    }
+
+    /// Of each episode, how many steps before its first the first place lies, and how many places there are.
+    fn counted(of: impl Iterator<Item = (usize, usize)>) -> Self {
+        let (mut ends, mut before, mut sum) = (Vec::new(), Vec::new(), 0);
+        for (steps, count) in of {
+            sum += count;
+            ends.push(sum);
+            before.push(steps);
+        }
+        Self { ends, before }
     }
 
     /// Whether no episode has room for the piece.
@@ -99,7 +116,7 @@ impl Places {
         let drawn = rng.below(self.ends.last().copied().unwrap_or(0));
         let episode = self.ends.partition_point(|end| *end <= drawn);
         let first = episode.checked_sub(1).map_or(0, |before| self.ends[before]);
-        (episode, (drawn - first) as isize - self.before as isize)
+        (episode, (drawn - first) as isize - self.before[episode] as isize)
     }
 }
 
@@ -111,7 +128,7 @@ pub struct BlockShape {
     /// Tokens in a block: `block_len + 1 + length`.
     pub len: usize,
     /// How far the encoder looks back: a block may begin so many steps (T_x) before an episode's start; that of a GRU which runs on begins
-    /// there.
+    /// there, or in the episode that it follows.
     pub looks: Looks,
     /// Width of the latent.
     pub latent_dim: usize,
@@ -137,6 +154,15 @@ impl BlockShape {
     }
 }
 
+/// An episode and a place in it. One that follows another is half of the time taken for the first of its session: not every client keeps its
+/// history.
+fn drawn(episodes: &[Episode], places: &Places, rng: &mut Philox) -> (Episode, isize) {
+    let (index, start) = places.draw(rng);
+    let episode = &episodes[index];
+    let forgets = episode.reach() > 0 && rng.uniform() < 0.5;
+    (if forgets { episode.alone() } else { episode.clone() }, start)
+}
+
 /// Draws a batch of blocks; `places` must be made for this shape.
 ///
 /// # Errors
@@ -147,10 +173,12 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
     let (mut valid, mut history) = (Vec::with_capacity(shape.batch * steps), Vec::with_capacity(shape.batch * shape.len * 3));
     let (mut successor, mut context) = (Vec::with_capacity(shape.batch * steps * 3), Vec::new());
     for _ in 0..shape.batch {
-        let (episode, start) = places.draw(rng);
+        let (episode, start) = drawn(episodes, places, rng);
+        // Nobody waits for a first episode: the memory of a GRU that runs on begins with it.
+        let start = if shape.looks == Looks::Running && episode.reach() == 0 { start.max(0) } else { start };
         let hidden = shape.hide.draw(rng);
         for t in start..start + shape.len as isize {
-            rows.push(&episodes[episode], t, Seen::ALL)?;
+            rows.push(&episode, t, Seen::ALL)?;
             history.extend(hidden.step(rng).flags());
         }
         for t in start..start + steps as isize {
@@ -158,7 +186,7 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
             let reward = rng.uniform() < shape.show_reward && action;
             valid.push(f32::from(t >= 0));
             if let Some(units) = &shape.context {
-                let mut row = episodes[episode].context(usize::try_from(t).unwrap_or(0))?.into_owned();
+                let mut row = episode.context(usize::try_from(t).unwrap_or(0))?.into_owned();
                 units.normalize_in_place(&mut row);
                 context.extend(row);
             }
@@ -262,8 +290,8 @@ pub enum Levels {
 }
 
 /// A window that was drawn.
-struct Drawn<'a> {
-    episode: &'a Episode,
+struct Drawn {
+    episode: Episode,
     /// Its first step.
     start: isize,
     standing: Standing,
@@ -278,15 +306,15 @@ struct Drawn<'a> {
 /// If an episode cannot be read.
 pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: Option<usize>, rng: &mut Philox) -> Result<WindowBatch> {
     let mut draw = || {
-        let (index, start) = places.draw(rng);
+        let (episode, start) = drawn(episodes, places, rng);
         let (drawn, imagined) = shape.draw_standing(rng);
         let imagined = if row.is_some() { 0 } else { imagined };
         let past = match shape.looks {
             Looks::Block(len) => len,
-            Looks::Running => start.unsigned_abs(),
+            Looks::Running => episode.reach() + start.unsigned_abs(),
         };
         let seen = shape.seen(past, imagined, rng);
-        Drawn { episode: &episodes[index], start, standing: row.map_or(drawn, Standing::Row), imagined, seen }
+        Drawn { episode, start, standing: row.map_or(drawn, Standing::Row), imagined, seen }
     };
     let drawn: Vec<Drawn> = (0..shape.batch).map(|_| draw()).collect();
     let layout = episodes[0].layout;
@@ -303,7 +331,7 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
         0 | 1 => None,
         real => Some(Tensor::from_vec(observed, (shape.batch, 1, (real - 1) * layout.dim()), &Device::Cpu)?),
     };
-    let pasts: Vec<_> = drawn.iter().map(|drawn| (drawn.episode, drawn.start)).collect();
+    let pasts: Vec<_> = drawn.iter().map(|drawn| (&drawn.episode, drawn.start)).collect();
     let (history, history_lens) = histories(&pasts, shape.looks, |row, back| drawn[row].seen[back])?;
     Ok(WindowBatch {
         history,
@@ -317,7 +345,7 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
 }
 
 /// The tokens before each place (episode, t), of which `seen(row, back)` is seen, `back` 0 being the last one: the last `len` of a block, or
-/// all of them from the start of the episode on, with padding behind, and how many there are.
+/// all of them from the start of the episode on, or of that which it follows, with padding behind, and how many there are.
 ///
 /// # Errors
 /// If an episode cannot be read.
@@ -332,26 +360,27 @@ pub fn histories(places: &[(&Episode, isize)], looks: Looks, seen: impl Fn(usize
             Ok((rows.tokens(places.len(), len)?, None))
         }
         Looks::Running => {
-            let lens: Vec<usize> = places.iter().map(|(_, t)| t.unsigned_abs()).collect();
+            let lens: Vec<usize> = places.iter().map(|(episode, t)| episode.reach() + t.unsigned_abs()).collect();
             let longest = lens.iter().copied().max().unwrap_or(0).max(1);
-            for (row, (episode, _)) in places.iter().enumerate() {
-                (0..lens[row]).try_for_each(|t| rows.push(episode, t as isize, seen(row, lens[row] - 1 - t)))?;
-                (lens[row]..longest).try_for_each(|_| rows.push(episode, -1, Seen::NOTHING))?;
+            for (row, (episode, t)) in places.iter().enumerate() {
+                (0..lens[row]).rev().try_for_each(|back| rows.push(episode, t - 1 - back as isize, seen(row, back)))?;
+                (lens[row]..longest).for_each(|_| rows.push_absent());
             }
             Ok((rows.tokens(places.len(), longest)?, Some(lens)))
         }
     }
 }
 
-/// (s_t, a_t), zeros for what is not seen and before the start.
+/// (s_t, a_t), zeros for what is not seen and where there is no such step.
 fn push_step(out: &mut Vec<f32>, episode: &Episode, t: isize, seen: Seen) -> io::Result<()> {
-    let (Layout { state_dim, action_dim }, inside) = (episode.layout, usize::try_from(t).ok());
-    match inside.filter(|_| seen.state) {
-        Some(t) => out.extend_from_slice(&episode.state(t)?),
+    let Layout { state_dim, action_dim } = episode.layout;
+    let step = episode.step(t)?;
+    match step.as_ref().filter(|_| seen.state) {
+        Some(step) => out.extend_from_slice(&step.state),
         None => out.extend(std::iter::repeat_n(0.0, state_dim)),
     }
-    match inside.filter(|_| seen.action) {
-        Some(t) => out.extend_from_slice(&episode.action(t)?),
+    match step.as_ref().filter(|_| seen.action) {
+        Some(step) => out.extend_from_slice(&step.action),
         None => out.extend(std::iter::repeat_n(0.0, action_dim)),
     }
     Ok(())

@@ -1,7 +1,10 @@
 //! Every number of a batch says where it comes from, so what is cut, hidden and shown can be read off.
 
 use super::*;
-use crate::model::method::Schedule;
+use crate::{
+    model::method::Schedule,
+    train::dataset::{Sides, Span, Which},
+};
 
 const LAYOUT: Layout = Layout { state_dim: 2, action_dim: 1 };
 
@@ -206,4 +209,104 @@ fn levels_may_be_drawn_one_by_one() {
     assert!(seen.iter().all(|count| (80..190).contains(count)), "{seen:?}");
     let batch = draw(shape(uniform, Levels::Schedule));
     assert!(batch.at.iter().all(|at| row_of(at) < 5) && batch.imagined == [0; 300]);
+}
+
+/// The second of two episodes of 5 and 12 steps, numbers as in [`episodes`]: t / 10 of the first, 100 + t / 10 of the second.
+fn following() -> Episode {
+    following_as(false)
+}
+
+fn following_as(play: bool) -> Episode {
+    let states = (0..17).flat_map(|row| if row < 5 { [row as f32, 0.0] } else { [(95 + row) as f32, 0.0] }).collect();
+    Episode::among(LAYOUT, [states, vec![0.5; 17], vec![0.25; 17], Vec::new()], Span { rows: 5..17, play, before: Some(0..4) })
+}
+
+#[test]
+fn before_an_episode_lies_a_border_and_the_one_that_it_follows() {
+    let episode = following();
+    assert_eq!((episode.len(), episode.reach(), episode.alone().reach()), (12, 5, 0));
+    let state = |episode: &Episode, t| episode.step(t).unwrap().map(|step| step.state[0]);
+    let expected = [None, Some(0.0), Some(1.0), Some(2.0), Some(3.0), None, Some(100.0), Some(101.0)];
+    assert_eq!((-6..2).map(|t| state(&episode, t)).collect::<Vec<_>>(), expected);
+    assert_eq!((state(&episode, 11), state(&episode, 12)), (Some(111.0), None));
+    assert_eq!((-6..2).filter_map(|t| state(&episode.alone(), t)).collect::<Vec<_>>(), [100.0, 101.0]);
+}
+
+/// Half of the blocks and windows of an episode that follows another look back into it, and half do not; what is explained lies in the
+/// episode itself.
+#[test]
+fn histories_cross_the_border() {
+    let episodes = vec![following()];
+    for looks in [Looks::Block(3), Looks::Running] {
+        let shape = BlockShape {
+            batch: 400,
+            len: 8,
+            looks,
+            latent_dim: 2,
+            stays: false,
+            context: None,
+            show_action: 0.5,
+            show_reward: 0.5,
+            hide: Hide::NOTHING,
+        };
+        let batch = blocks(&episodes, &shape.places(&episodes), &shape, &mut Philox::new(1)).unwrap();
+        let (states, present, valid) = (rows(&batch.tokens.state), rows(&batch.tokens.present), batch.valid.to_vec2::<f32>().unwrap());
+        let mut crossed = 0;
+        for row in 0..shape.batch {
+            let own = (0..shape.len).position(|t| states[row][t][0] >= 100.0).unwrap();
+            assert!((0..shape.len - 1).all(|t| valid[row][t] == f32::from(t >= own)), "steps of another episode are explained");
+            let earlier: Vec<f32> = (0..own).filter(|t| present[row][*t][0] == 1.0).map(|t| states[row][t][0]).collect();
+            if !earlier.is_empty() {
+                crossed += 1;
+                assert!(own >= 2 && present[row][own - 1] == [0.0; 3], "the border");
+                assert_eq!((earlier[earlier.len() - 1], states[row][own][0]), (3.0, 100.0), "what lies on both of its sides");
+            }
+        }
+        assert!((30..340).contains(&crossed), "{looks:?}: {crossed}");
+    }
+    let table = Table::new(Schedule::Ladder, 4, 1, 8).unwrap();
+    let shape = WindowShape {
+        batch: 400,
+        horizon: 4,
+        looks: Looks::Running,
+        obs_horizon: 3,
+        table,
+        levels: Levels::Schedule,
+        action_horizons: vec![1],
+        ready_fraction: 0.5,
+        hide: Hide::NOTHING,
+    };
+    let batch = windows(&episodes, &shape.places(&episodes), &shape, None, &mut Philox::new(1)).unwrap();
+    let (window, states, lens) = (rows(&batch.window), rows(&batch.history.state), batch.history_lens.unwrap());
+    let observed = rows(&batch.observed.unwrap());
+    let mut crossed = 0;
+    for row in 0..shape.batch {
+        let t = window[row][0][0] as usize - 100;
+        let follows = lens[row] == t + 5;
+        crossed += usize::from(follows);
+        assert!(follows || lens[row] == t);
+        assert!(!follows || (0..4).all(|back| states[row][back][0] == back as f32), "from the start of the episode before on");
+        // (s, a) of two steps, of which the border is none.
+        let last = if t > 0 { 99.0 + t as f32 } else { 0.0 };
+        assert_eq!(observed[row][0][3], last);
+        assert_eq!(
+            observed[row][0][0],
+            if t > 1 {
+                98.0 + t as f32
+            } else if t == 0 && follows {
+                3.0
+            } else {
+                0.0
+            }
+        );
+    }
+    assert!((150..250).contains(&crossed), "{crossed}");
+}
+
+/// What is meant by a loss is what it draws from.
+#[test]
+fn play_is_told_from_demonstrations() {
+    let sides = Sides { train: [true, false, true].map(following_as).to_vec(), held_out: vec![following_as(false)] };
+    let count = |which| (sides.only(which).train.len(), sides.only(which).held_out.len());
+    assert_eq!([Which::All, Which::Play, Which::Demonstrations].map(count), [(3, 1), (2, 0), (1, 1)]);
 }

@@ -10,7 +10,7 @@ use crate::model::{
 use crate::train::{
     Task,
     dataset::{
-        Episode,
+        Episode, Sides,
         window::{Places, TokenRows},
     },
     probe::places,
@@ -33,6 +33,7 @@ pub struct ContextFreeLoss<'a> {
     /// In the sum that the stage minimizes.
     weight: f64,
     batch: usize,
+    episodes: Sides,
     places: Places,
 }
 
@@ -41,7 +42,8 @@ impl<'a> ContextFreeLoss<'a> {
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
         let weight = task.recipe.stages.get(stage)?.weight(Loss::ContextFree);
         let config = task.recipe.losses.context_free.as_ref().filter(|_| weight > 0.0)?;
-        Some(Self { task, weight, batch: config.batch, places: Places::new(&task.split.train, 0, 2) })
+        let episodes = task.split.episodes.only(config.episodes);
+        Some(Self { task, weight, batch: config.batch, places: Places::new(&episodes.train, 0, 2), episodes })
     }
 
     /// Draws the batch of a step.
@@ -51,7 +53,7 @@ impl<'a> ContextFreeLoss<'a> {
     pub(super) fn job<'b>(&'b self, networks: &'b Networks, rng: &mut Philox) -> Result<Job<'b>> {
         let drawn: Vec<(usize, usize)> =
             (0..self.batch).map(|_| self.places.draw(rng)).map(|(episode, t)| (episode, t.unsigned_abs())).collect();
-        let batch = transitions(&self.task.split.train, &drawn)?;
+        let batch = transitions(&self.episodes.train, &drawn)?;
         Ok(Box::new(move || {
             let terms = baseline(networks)?.loss(&batch, &self.task.config.units.normalizer.state_change_std)?;
             let mean = |name, tensor: &Tensor| -> Result<Mean> { Ok(Mean { name, sum: f64::from(tensor.to_scalar::<f32>()?), count: 1 }) };
@@ -70,7 +72,7 @@ impl<'a> ContextFreeLoss<'a> {
     /// # Errors
     /// If a tensor operation fails.
     pub fn held_out(&self, networks: &Networks) -> Result<f64> {
-        let episodes = &self.task.split.held_out;
+        let episodes = &self.episodes.held_out;
         let batch = transitions(episodes, &places(episodes, HELD_OUT_ROWS))?;
         let terms = baseline(networks)?.loss(&batch, &self.task.config.units.normalizer.state_change_std)?;
         Ok(f64::from(terms.loss.to_scalar::<f32>()?))
@@ -83,7 +85,8 @@ impl<'a> ContextFreeLoss<'a> {
 /// # Errors
 /// If a tensor operation fails.
 pub fn measure_surprises(task: &Task, networks: &Networks, vars: &BTreeMap<String, Var>) -> Result<()> {
-    let episodes = &task.split.held_out;
+    let which = task.recipe.losses.context_free.as_ref().map(|loss| loss.episodes).unwrap_or_default();
+    let episodes = &task.split.episodes.only(which).held_out;
     let residuals = baseline(networks)?.residuals(&transitions(episodes, &places(episodes, HELD_OUT_ROWS))?)?;
     let change = &task.config.units.normalizer.state_change_std;
     for (index, (residual, name)) in residuals.iter().zip(WHITENERS).enumerate() {

@@ -12,7 +12,7 @@ use crate::model::{
 use crate::train::{
     Task,
     dataset::{
-        HELD_OUT_SEED,
+        HELD_OUT_SEED, Sides, Which,
         hidden::Hide,
         window::{Levels, Places, WindowShape, windows},
     },
@@ -37,6 +37,8 @@ pub struct DenoiseLoss<'a> {
     /// In the sum that the stage minimizes.
     weight: f64,
     shape: WindowShape,
+    /// Those to imitate.
+    episodes: Sides,
     places: Places,
     options: RefineOptions,
 }
@@ -76,7 +78,8 @@ impl<'a> DenoiseLoss<'a> {
             sub_steps: sampler.sub_steps,
             moves_latents,
         };
-        Self { task, weight, places: shape.places(&task.split.train), shape, options }
+        let episodes = task.split.episodes.only(Which::Demonstrations);
+        Self { task, weight, places: shape.places(&episodes.train), shape, episodes, options }
     }
 
     /// Draws the batch of a step; a job for each shard.
@@ -84,7 +87,7 @@ impl<'a> DenoiseLoss<'a> {
     /// # Errors
     /// If an episode cannot be read.
     pub(super) fn jobs<'b>(&'b self, networks: &'b Networks, rng: &mut Philox) -> Result<Vec<Job<'b>>> {
-        let batch = windows(&self.task.split.train, &self.places, &self.shape, None, rng)?;
+        let batch = windows(&self.episodes.train, &self.places, &self.shape, None, rng)?;
         let all = batch.at.len();
         let job = |shard: Range<usize>| -> Result<Job<'b>> {
             let (share, part) = (shard.len() as f64 / all as f64, batch.narrow(shard.start, shard.len())?);
@@ -112,7 +115,7 @@ impl<'a> DenoiseLoss<'a> {
     /// If a tensor operation fails.
     pub fn held_out_errors(&self, networks: &Networks) -> Result<Vec<f64>> {
         let shape = WindowShape { batch: HELD_OUT_WINDOWS, hide: Hide::NOTHING, ..self.shape.clone() };
-        let (episodes, rows) = (&self.task.split.held_out, shape.table.emit());
+        let (episodes, rows) = (&self.episodes.held_out, shape.table.emit());
         let places = shape.places(episodes);
         let error = |row: usize| -> Result<f64> {
             let batch = windows(episodes, &places, &shape, Some(row), &mut Philox::new(HELD_OUT_SEED))?;

@@ -9,7 +9,7 @@ use crate::model::{
 use crate::train::{
     Task,
     dataset::{
-        HELD_OUT_SEED,
+        HELD_OUT_SEED, Sides,
         window::{BlockShape, Places, blocks},
     },
     learner::Scalars,
@@ -30,6 +30,7 @@ pub struct ElboLoss<'a> {
     /// Steps on this loss in earlier stages: the warm-up of the KL weight goes on.
     before: usize,
     shape: BlockShape,
+    episodes: Sides,
     places: Places,
 }
 
@@ -51,7 +52,8 @@ impl<'a> ElboLoss<'a> {
             hide: task.recipe.hide,
         };
         let before = earlier.iter().filter(|stage| stage.weight(Loss::Elbo) > 0.0).map(|stage| stage.steps).sum();
-        Some(Self { task, config, weight, before, places: shape.places(&task.split.train), shape })
+        let episodes = task.split.episodes.only(config.episodes);
+        Some(Self { task, config, weight, before, places: shape.places(&episodes.train), shape, episodes })
     }
 
     /// Draws the batch of this step of the stage.
@@ -59,7 +61,7 @@ impl<'a> ElboLoss<'a> {
     /// # Errors
     /// If an episode cannot be read.
     pub(super) fn job<'b>(&'b self, networks: &'b Networks, step: usize, rng: &mut Philox) -> Result<Job<'b>> {
-        let batch = blocks(&self.task.split.train, &self.places, &self.shape, rng)?;
+        let batch = blocks(&self.episodes.train, &self.places, &self.shape, rng)?;
         let kl_weight = self.config.kl_weight.at(self.before + step);
         Ok(Box::new(move || {
             let (loss, means) = self.evaluate(networks, &batch, kl_weight)?;
@@ -100,7 +102,7 @@ impl<'a> ElboLoss<'a> {
     /// # Errors
     /// If a tensor operation fails.
     pub fn held_out(&self, networks: &Networks) -> Result<Scalars> {
-        let (episodes, shape) = (&self.task.split.held_out, BlockShape { batch: HELD_OUT_BLOCKS, ..self.shape.clone() });
+        let (episodes, shape) = (&self.episodes.held_out, BlockShape { batch: HELD_OUT_BLOCKS, ..self.shape.clone() });
         let places = shape.places(episodes);
         if places.is_empty() {
             return Ok(Vec::new());

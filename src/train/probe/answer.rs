@@ -102,7 +102,7 @@ pub fn probe(question: &Question, room: &Room) -> Result<Answer> {
     dataset.leave_out_shorter(config.method.latent.block_len() + 2 + ahead, "the block length + 2 + what is asked ahead")?;
     let notes = std::mem::take(&mut dataset.notes);
     let (split, _) = dataset.split(UnitsFrom::Checkpoint(&config.units))?;
-    let subjects = Subjects { train: &split.train, held_out: &split.held_out, rows_max: ROWS };
+    let subjects = Subjects { train: &split.episodes.train, held_out: &split.episodes.held_out, rows_max: ROWS };
     let looks = config.method.latent.gru().map_or(Looks::Block(0), |gru| gru.looks);
     let mut scores = Vec::new();
     for looks in shorter(looks) {

@@ -42,10 +42,11 @@ fn posteriors(
         visit(match looks {
             Looks::Block(_) => latent.infer_after(&latent.past(&histories(&pasts, looks, |_, _| Seen::ALL)?.0, None)?, &ahead)?,
             Looks::Running => {
-                let (episode, at) = (pasts[0].0, chunk.iter().map(|(_, t)| *t).collect::<Vec<_>>());
+                let (episode, reach) = (pasts[0].0, pasts[0].0.reach());
+                let (at, len) = (chunk.iter().map(|(_, t)| reach + t).collect::<Vec<_>>(), reach + episode.len());
                 let mut whole = TokenRows::new(episode.layout);
-                (0..episode.len()).try_for_each(|t| whole.push(episode, t as isize, Seen::ALL))?;
-                latent.infer_within(&whole.tokens(1, episode.len())?, &at, &ahead)?
+                (0..len).try_for_each(|t| whole.push(episode, t as isize - reach as isize, Seen::ALL))?;
+                latent.infer_within(&whole.tokens(1, len)?, &at, &ahead)?
             }
         })?;
     }

@@ -9,6 +9,7 @@ use crate::model::{
     latent::elbo::Ahead,
     method::{Future, Schedule},
 };
+use crate::train::dataset::Which;
 use serde::{Deserialize, Serialize};
 
 /// Rows of one batch.
@@ -57,6 +58,9 @@ pub struct Losses {
 pub struct ContextFreeConfig {
     /// Transitions in a batch.
     pub batch: usize,
+    /// Which episodes they are drawn from. An expert that sees the context gives it away by its actions; play does not.
+    #[serde(default, skip_serializing_if = "is_all")]
+    pub episodes: Which,
 }
 
 /// The evidence lower bound of what the latent explains (section 4.2 of the paper).
@@ -65,6 +69,9 @@ pub struct ContextFreeConfig {
 pub struct ElboConfig {
     /// Blocks in a batch.
     pub batch: usize,
+    /// Which episodes they are drawn from.
+    #[serde(default, skip_serializing_if = "is_all")]
+    pub episodes: Which,
     /// Steps of a block beyond its first `block_len + 1` tokens; that of a GRU which runs on begins at an episode's start.
     pub length: usize,
     /// Weight of the KL term; its warm-up counts the steps of all stages that minimize the ELBO.
@@ -106,6 +113,10 @@ impl ElboConfig {
         between("losses.elbo.ahead.steps", self.ahead.steps, 0..=self.length - 1)?;
         between("losses.elbo.free_bits", self.free_bits, WEIGHTS)
     }
+}
+
+fn is_all(which: &Which) -> bool {
+    *which == Which::All
 }
 
 fn is_off(ahead: &Ahead) -> bool {

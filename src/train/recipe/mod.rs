@@ -129,6 +129,8 @@ impl Recipe {
                 sub_steps: self.sub_steps(),
                 missing: self.hide.trained(),
                 refined: self.refines(),
+                // What only the data tell.
+                sessions: false,
             },
             defaults: Defaults { sampler: self.sampler.clone(), restart: self.restart },
         }

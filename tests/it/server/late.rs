@@ -95,7 +95,7 @@ impl Oracle {
                 Outcome::Acted(chunk.actions)
             }
             Message::Reset { seed, .. } => {
-                self.episode = self.agent.reset(&self.episode, *seed, false);
+                self.episode = self.agent.reset(&self.episode, *seed, false).unwrap();
                 (self.number, self.step) = (self.number + 1, 0);
                 Outcome::Stands(self.number, 0)
             }

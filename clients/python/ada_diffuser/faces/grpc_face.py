@@ -219,7 +219,7 @@ def _model(model: models_pb2.Model) -> Model:
 
 def _trained(trained: models_pb2.Trained) -> Trained:
     missing = Missing(trained.missing.state, trained.missing.action, trained.missing.reward)
-    return Trained(tuple(trained.action_horizons), tuple(trained.sub_steps), missing)
+    return Trained(tuple(trained.action_horizons), tuple(trained.sub_steps), missing, trained.sessions)
 
 
 def _summary(session: agent_pb2.Session) -> SessionSummary:

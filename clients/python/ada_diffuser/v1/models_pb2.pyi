@@ -73,14 +73,16 @@ class Model(_message.Message):
     def __init__(self, name: _Optional[str] = ..., digest: _Optional[str] = ..., is_default: bool = ..., state_dim: _Optional[int] = ..., action_dim: _Optional[int] = ..., plan_horizon: _Optional[int] = ..., block_len: _Optional[int] = ..., obs_horizon: _Optional[int] = ..., latent_dim: _Optional[int] = ..., level_max: _Optional[int] = ..., action_low: _Optional[_Iterable[float]] = ..., action_high: _Optional[_Iterable[float]] = ..., sampler: _Optional[_Union[SamplerOptions, _Mapping]] = ..., refined: bool = ..., trained: _Optional[_Union[Trained, _Mapping]] = ...) -> None: ...
 
 class Trained(_message.Message):
-    __slots__ = ("action_horizons", "sub_steps", "missing")
+    __slots__ = ("action_horizons", "sub_steps", "missing", "sessions")
     ACTION_HORIZONS_FIELD_NUMBER: _ClassVar[int]
     SUB_STEPS_FIELD_NUMBER: _ClassVar[int]
     MISSING_FIELD_NUMBER: _ClassVar[int]
+    SESSIONS_FIELD_NUMBER: _ClassVar[int]
     action_horizons: _containers.RepeatedScalarFieldContainer[int]
     sub_steps: _containers.RepeatedScalarFieldContainer[int]
     missing: Missing
-    def __init__(self, action_horizons: _Optional[_Iterable[int]] = ..., sub_steps: _Optional[_Iterable[int]] = ..., missing: _Optional[_Union[Missing, _Mapping]] = ...) -> None: ...
+    sessions: bool
+    def __init__(self, action_horizons: _Optional[_Iterable[int]] = ..., sub_steps: _Optional[_Iterable[int]] = ..., missing: _Optional[_Union[Missing, _Mapping]] = ..., sessions: bool = ...) -> None: ...
 
 class Missing(_message.Message):
     __slots__ = ("state", "action", "reward")

@@ -74,7 +74,7 @@ fn a_reset_keeps_the_memory_if_asked() {
 
 fn check_a_reset_keeps_the_memory(agent: &Agent) {
     let (episode, _) = agent.act(&agent.open(1, &options()).unwrap(), &told(0..4)).unwrap();
-    let latent = |keep| agent.act(&agent.reset(&episode, 1, keep), &told(0..0)).unwrap().1.latent_mean;
+    let latent = |keep| agent.act(&agent.reset(&episode, 1, keep).unwrap(), &told(0..0)).unwrap().1.latent_mean;
     assert_ne!(latent(true), latent(false));
     assert_eq!(latent(false), agent.act(&agent.open(1, &options()).unwrap(), &told(0..0)).unwrap().1.latent_mean);
 }

@@ -6,7 +6,7 @@ mod links;
 mod lzf;
 
 use super::{
-    Dataset, DatasetError,
+    Dataset, DatasetError, Span,
     room::Room,
     rows::{Field, FieldWriter, Fields, pieces},
 };
@@ -32,13 +32,18 @@ const TERMINALS: [&str; 2] = ["terminals", "terminations"];
 const TIMEOUTS: [&str; 2] = ["timeouts", "truncations"];
 /// The hidden truth, where it was recorded.
 const CONTEXT: &str = "infos/context";
+/// Whether an episode shows what comes of actions and is nothing to imitate.
+const PLAY: &str = "infos/play";
+/// Number of the session of an episode: consecutive episodes of one follow one another.
+const SESSION: &str = "infos/session";
 /// Bytes of a piece that is read at once, or one row of chunks where that is more: so every chunk is unpacked once.
 const PIECE_BYTES: usize = 1 << 20;
 /// Layout class of a virtual data set.
 const VIRTUAL: u8 = 3;
 
 /// Reads and checks the file: `observations (N, d_s)`, `actions (N, d_a)`, `rewards (N,)`, `terminals (N,)` or `terminations (N,)`, and
-/// where there are any `timeouts (N,)`, `truncations (N,)` and `infos/context (N, d_c)`, the hidden truth that only the probe looks at.
+/// where there are any `timeouts (N,)`, `truncations (N,)`, `infos/context (N, d_c)`, the hidden truth that only the probe looks at, and
+/// `infos/play (N,)` and `infos/session (N,)`, the same in all steps of an episode.
 ///
 /// # Errors
 /// If the file cannot be read, an array is missing, present but unreadable, of another shape or type, or holds a value that is not finite.
@@ -47,25 +52,36 @@ pub fn read(path: &Path, room: &Room) -> Result<Dataset, DatasetError> {
     let observations = arrays.require("observations")?;
     let rows = observations.rows;
     let [actions, rewards] = [arrays.require("actions")?, arrays.require("rewards")?];
-    let context = arrays.find(CONTEXT)?;
+    let [context, play, session] = [arrays.find(CONTEXT)?, arrays.find(PLAY)?, arrays.find(SESSION)?];
     let [terminals, timeouts] = [arrays.all(TERMINALS)?, arrays.all(TIMEOUTS)?];
     if terminals.is_empty() {
         arrays.require(TERMINALS[0])?;
     }
-    for array in [&observations, &actions, &rewards].into_iter().chain(&context).chain(&terminals).chain(&timeouts) {
+    let optional = context.iter().chain(&play).chain(&session);
+    for array in [&observations, &actions, &rewards].into_iter().chain(optional).chain(&terminals).chain(&timeouts) {
         arrays.check(array, rows)?;
     }
-    let spans = spans(&arrays.flags(terminals.iter().chain(&timeouts), rows)?);
+    let rows_of = spans(&arrays.flags(terminals.iter().chain(&timeouts), rows)?);
     let mut notes = Vec::new();
     if timeouts.is_empty() {
-        let longest = spans.iter().map(Range::len).max().unwrap_or(0);
+        let longest = rows_of.iter().map(Range::len).max().unwrap_or(0);
         let ends = terminals.iter().map(|array| format!("`{}`", array.field)).collect::<Vec<_>>().join(" and ");
         notes.push(format!(
             "{}: no `timeouts` or `truncations`, so episodes end at {ends} only; the longest of {} has {longest} steps",
             arrays.path,
-            spans.len()
+            rows_of.len()
         ));
     }
+    let of_episodes = |array: &Option<Array>| array.as_ref().map(|array| arrays.of_episodes(array, &rows_of)).transpose();
+    let (play, session) = (of_episodes(&play)?, of_episodes(&session)?);
+    let follows = |index: usize| session.as_ref().is_some_and(|session| index > 0 && session[index - 1] == session[index]);
+    let episode = |(index, rows): (usize, &Range<usize>)| Span {
+        rows: rows.clone(),
+        play: play.as_ref().is_some_and(|play| play[index] != 0.0),
+        // What came of an episode's last act no other act tells.
+        before: follows(index).then(|| rows_of[index - 1].start..rows_of[index - 1].end - 1),
+    };
+    let episodes = rows_of.iter().enumerate().map(episode).collect();
     let columns: usize = [&observations, &actions, &rewards].into_iter().chain(&context).map(|array| array.width).sum();
     let bytes = 4 * (rows * columns) as u64;
     let in_file = bytes > room.memory_bytes;
@@ -83,7 +99,7 @@ pub fn read(path: &Path, room: &Room) -> Result<Dataset, DatasetError> {
         rewards: store(&rewards)?,
         context: context.as_ref().map_or_else(|| Ok(Field::in_memory(0, Vec::new())), store)?,
     };
-    Ok(Dataset { digest: digest(path).map_err(|error| arrays.unreadable(error))?, path: arrays.path, fields, episodes: spans, notes })
+    Ok(Dataset { digest: digest(path).map_err(|error| arrays.unreadable(error))?, path: arrays.path, fields, episodes, notes })
 }
 
 /// Half-open ranges of the episodes; rows after the last end flag are an episode of their own.
@@ -238,6 +254,22 @@ impl Arrays {
             })?;
         }
         Ok(flags)
+    }
+
+    /// The number that an array has in all rows of each episode.
+    fn of_episodes(&self, array: &Array, spans: &[Range<usize>]) -> Result<Vec<f32>, DatasetError> {
+        let mut rows = Vec::with_capacity(array.rows);
+        self.visit(array, |_, elements| {
+            rows.extend(elements.iter().map(|element| element.value));
+            Ok(())
+        })?;
+        let number = |span: &Range<usize>| match span.clone().find(|row| rows[*row] != rows[span.start]) {
+            None => Ok(rows[span.start]),
+            Some(row) => {
+                Err(self.invalid(array.field, format!("changes at row {row}, within the episode that begins at row {}", span.start)))
+            }
+        };
+        spans.iter().map(number).collect()
     }
 
     fn store(&self, array: &Array, room: &Room, in_file: bool) -> Result<Field, DatasetError> {
