@@ -50,8 +50,8 @@ pub struct Baseline {
 pub struct Surprises<V = Tensor> {
     /// The arrival at s_t from s_{t-1} by a_{t-1}: `(B, L, state_dim)`.
     pub state: V,
-    /// a_t in s_t: `(B, L, action_dim)`.
-    pub action: V,
+    /// a_t in s_t: `(B, L, action_dim)`; none where nobody looks at it.
+    pub action: Option<V>,
     /// r_t of a_t in s_t: `(B, L, 1)`.
     pub reward: V,
 }
@@ -74,7 +74,8 @@ impl Surprises {
     /// # Errors
     /// Those of `change`.
     pub fn map(&self, change: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
-        Ok(Self { state: change(&self.state)?, action: change(&self.action)?, reward: change(&self.reward)? })
+        let action = self.action.as_ref().map(&change).transpose()?;
+        Ok(Self { state: change(&self.state)?, action, reward: change(&self.reward)? })
     }
 }
 
@@ -93,22 +94,22 @@ impl Baseline {
     }
 
     /// How far each token is from what was expected: facts for all who look at them, which move no baseline. Only where
-    /// [`super::Before::told`] says so are they more than numbers.
+    /// [`super::Before::told`] says so are they more than numbers. What is expected of actions is asked only where somebody looks `at_actions`.
     ///
     /// # Errors
     /// If widths differ from the layout, or nobody says what came before the tokens.
-    pub fn surprises<V: Activations>(&self, tokens: &Tokens<V>) -> Result<Surprises<V>> {
+    pub fn surprises<V: Activations>(&self, tokens: &Tokens<V>, at_actions: bool) -> Result<Surprises<V>> {
         let Some(before) = &tokens.before else { bail!("tokens without what came before them: is a bug") };
         let arrival = self.change.forward(&V::beside(&[&before.state, &before.action])?)?.plus(&before.state)?;
-        let action = self.action.forward(&tokens.state)?;
+        let action = at_actions.then(|| self.action.forward(&tokens.state)).transpose()?;
         let reward = self.reward.forward(&V::beside(&[&tokens.state, &tokens.action])?)?;
-        let surprise = |seen: &V, expected, i: usize| {
-            self.surprise[i].forward(&seen.clone().minus(expected)?)?.clamped(-SURPRISE_MAX, SURPRISE_MAX).map(V::detached)
+        let surprise = |seen: &V, expected: V, i: usize| {
+            self.surprise[i].forward(&seen.clone().minus(&expected)?)?.clamped(-SURPRISE_MAX, SURPRISE_MAX).map(V::detached)
         };
         Ok(Surprises {
-            state: surprise(&tokens.state, &arrival, 0)?,
-            action: surprise(&tokens.action, &action, 1)?,
-            reward: surprise(&tokens.reward, &reward, 2)?,
+            state: surprise(&tokens.state, arrival, 0)?,
+            action: action.map(|action| surprise(&tokens.action, action, 1)).transpose()?,
+            reward: surprise(&tokens.reward, reward, 2)?,
         })
     }
 

@@ -88,7 +88,7 @@ impl LatentModel {
 
     /// How far each token of a block is from what was expected: facts, of which the encoder is shown some and the decoders have to explain all.
     fn surprises(&self, tokens: &Tokens) -> Result<Option<Surprises>> {
-        let of = |baseline: &Baseline| baseline.surprises(&tokens.clone().following(None)?);
+        let of = |baseline: &Baseline| baseline.surprises(&tokens.clone().following(None)?, true);
         self.baseline.as_ref().map(of).transpose()
     }
 
@@ -297,7 +297,8 @@ impl Aims {
             let std = Tensor::new(options.state_change_std.as_slice(), change.device())?;
             return Ok(Self { state: change.broadcast_div(&std)?, reward: cut(&tokens.reward, from)?, action: None, context });
         };
-        Ok(Self { state: cut(state, from + 1)?, reward: cut(reward, from)?, action: Some(cut(action, from)?), context })
+        let action = action.as_ref().map(|action| cut(action, from)).transpose()?;
+        Ok(Self { state: cut(state, from + 1)?, reward: cut(reward, from)?, action, context })
     }
 
     fn narrow(&self, start: usize, len: usize) -> Result<Self> {

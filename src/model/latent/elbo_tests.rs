@@ -265,7 +265,7 @@ fn surprises_by_hand() {
     params.vars()["baseline.surprise.state.weight"].set(&whitener).unwrap();
     let (tokens, baseline) = (batch().tokens, model.baseline.as_ref().unwrap());
     let followed = tokens.clone().following(None).unwrap();
-    let surprises = baseline.surprises(&followed).unwrap();
+    let surprises = baseline.surprises(&followed, true).unwrap();
     for t in 1..LEN {
         let [change, ..] = baseline.residuals(&tokens.narrow(t - 1, 2).unwrap()).unwrap();
         let expected = change.broadcast_matmul(&whitener.t().unwrap()).unwrap();
@@ -278,8 +278,11 @@ fn surprises_by_hand() {
     // Looked at from the middle on, with the token in front, the rest is the same.
     let rest = tokens.narrow(2, 3).unwrap().following(Some(&tokens.at(&[Some(1); BATCH]).unwrap())).unwrap();
     let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    assert_eq!(flat(&baseline.surprises(&rest).unwrap().state), flat(&surprises.state.narrow(1, 2, 3).unwrap().contiguous().unwrap()));
-    assert!(baseline.surprises(&tokens).is_err(), "nobody said what came before");
+    assert_eq!(
+        flat(&baseline.surprises(&rest, true).unwrap().state),
+        flat(&surprises.state.narrow(1, 2, 3).unwrap().contiguous().unwrap())
+    );
+    assert!(baseline.surprises(&tokens, true).is_err(), "nobody said what came before");
 }
 
 /// At many places of an episode that is read once, and at each after its own history: the same beliefs.

@@ -57,9 +57,9 @@ impl Parts {
     }
 
     /// Embeddings, each where `told` (B, L, 3) says that it is known.
-    fn forward<V: Activations>(&self, [state, action, reward]: [&V; 3], told: &V) -> Result<[Option<V>; 3]> {
+    fn forward<V: Activations>(&self, state: &V, action: Option<&V>, reward: &V, told: &V) -> Result<[Option<V>; 3]> {
         let part = |part: &Part, value: &V, index| part.forward(value, &told.channels(index, 1)?);
-        let action = self.action.as_ref().map(|of| part(of, action, 1)).transpose()?;
+        let action = self.action.as_ref().zip(action).map(|(of, action)| part(of, action, 1)).transpose()?;
         Ok([Some(part(&self.state, state, 0)?), action, Some(part(&self.reward, reward, 2)?)])
     }
 }
@@ -91,6 +91,11 @@ impl Encoder {
         })
     }
 
+    /// Whether it looks at actions, and at what is surprising in them.
+    pub(super) fn sees_actions(&self) -> bool {
+        self.parts.action.is_some()
+    }
+
     /// GRU states after each token, beside a baseline with its surprises: `(B, L)` tokens to `(B, L, hidden)`; `before` is the state before the first, zero if none.
     ///
     /// # Errors
@@ -109,10 +114,10 @@ impl Encoder {
     }
 
     fn embed<V: Activations>(&self, tokens: &Tokens<V>, surprises: Option<&Surprises<V>>) -> Result<V> {
-        let seen = self.parts.forward([&tokens.state, &tokens.action, &tokens.reward], &tokens.present)?;
+        let seen = self.parts.forward(&tokens.state, Some(&tokens.action), &tokens.reward, &tokens.present)?;
         let surprised = match (&self.surprise, surprises, &tokens.before) {
             (Some(parts), Some(Surprises { state, action, reward }), Some(before)) => {
-                parts.forward([state, action, reward], &before.told)?
+                parts.forward(state, action.as_ref(), reward, &before.told)?
             }
             _ => [const { None }; 3],
         };

@@ -112,7 +112,7 @@ impl LatentModel {
 
     /// States of the GRU after each token, `(B, L, hidden)`.
     fn states<V: Activations>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
-        let surprises = self.baseline.as_ref().map(|baseline| baseline.surprises(tokens)).transpose()?;
+        let surprises = self.baseline.as_ref().map(|baseline| baseline.surprises(tokens, self.encoder.sees_actions())).transpose()?;
         self.encoder.states(tokens, surprises.as_ref(), before)
     }
 
