@@ -19,7 +19,7 @@ use rows::Fields;
 use serde::{Deserialize, Serialize};
 use std::{fmt, io, ops::Range, sync::Arc};
 
-/// One episode in this many is held out.
+/// One session in this many is held out.
 const HELD_OUT_EVERY: usize = 10;
 /// Seed of the split: the same for all training seeds, so that their held-out numbers can be compared.
 const SPLIT_SEED: u64 = 0x5EED;
@@ -194,22 +194,20 @@ impl Dataset {
         Ok(())
     }
 
-    /// Splits by episodes, drawn once and for all seeds alike, and brings them to units. What was chosen for the columns of actions is
+    /// Splits by sessions, mostly of one episode, drawn once and for all seeds alike, and brings them to units. What was chosen for the columns of actions is
     /// told beside it; with the units of a checkpoint nothing is chosen.
     ///
     /// # Errors
     /// If the bounds wished for do not fit the columns, or rows are kept in a file and it cannot be read.
     pub fn split(self, from: UnitsFrom) -> Result<(Split, Vec<ActionColumn>), DatasetError> {
-        let mut order: Vec<usize> = (0..self.episodes.len()).collect();
+        let mut order: Vec<&[Span]> = self.episodes.chunk_by(|_, next| next.before.is_some()).collect();
         let mut rng = Philox::new(SPLIT_SEED);
         for last in (1..order.len()).rev() {
             order.swap(last, rng.below(last + 1));
         }
-        let (held_out, train) = order.split_at(self.episodes.len().div_ceil(HELD_OUT_EVERY));
-        let mut train = train.to_vec();
-        train.sort_unstable();
-        let spans = |indices: &[usize]| indices.iter().map(|index| self.episodes[*index].clone()).collect::<Vec<_>>();
-        let (train, held_out) = (spans(&train), spans(held_out));
+        let (held_out, train) = order.split_at(order.len().div_ceil(HELD_OUT_EVERY));
+        let (mut train, held_out) = (train.concat(), held_out.concat());
+        train.sort_unstable_by_key(|span| span.rows.start);
         let (units, columns) = match from {
             UnitsFrom::Data(wishes) => self.fit(&train, wishes)?,
             UnitsFrom::Checkpoint(units) => (units.clone(), Vec::new()),
