@@ -9,7 +9,7 @@ use ada_diffuser::model::{
     denoiser::Given,
     diffusion::refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
     latent::Tokens,
-    method::{Backbone, GruLatent, Looks},
+    method::{Actions, Backbone, Baseline, Future, GruLatent, LatentSource, Looks},
     nn::{Activations, Buffer, Params},
     noise::Philox,
     options::SamplerOptions,
@@ -80,6 +80,29 @@ fn act(c: &mut Criterion) {
     }
 }
 
+/// What a latent costs an act that streams: a block looked at anew, a GRU that runs on, and the same beside a baseline, without and with a look
+/// at actions.
+fn latents(c: &mut Criterion) {
+    let plain = |looks, future| GruLatent { future, ..GruLatent::plain(8, 64, looks) };
+    let running = || plain(Looks::Running, Future::Held);
+    let baseline = Some(Baseline { width: 256 });
+    for (name, latent) in [
+        ("block", plain(Looks::Block(10), Future::Prior)),
+        ("running", running()),
+        ("surprises", GruLatent { baseline, actions: Actions::Unseen, ..running() }),
+        ("surprises-of-actions", GruLatent { baseline, ..running() }),
+    ] {
+        let mut config = config(Backbone::Unet { widths: vec![32, 64, 64, 64] });
+        (config.method.latent, config.trained.refined) = (LatentSource::Gru(latent), false);
+        config.defaults.sampler.kappa = 0.0;
+        let agent = Agent::new(config.clone(), frozen(&config), "bench".into());
+        let episode = agent.open(1, &SamplerOptions { streaming: true, ..config.defaults.sampler.clone() }).expect("opens");
+        let observation = Observation { state: vec![0.1; STATE], ..Observation::default() };
+        let (episode, _) = agent.act(&episode, &observation).expect("acts");
+        c.bench_function(&format!("act/latent/{name}"), |b| b.iter(|| black_box(agent.act(&episode, &observation).expect("acts"))));
+    }
+}
+
 fn train_step(c: &mut Criterion) {
     let batch_size = 64;
     for (name, net) in nets() {
@@ -105,5 +128,5 @@ fn train_step(c: &mut Criterion) {
     }
 }
 
-criterion_group! { name = all; config = Criterion::default().sample_size(20).warm_up_time(std::time::Duration::from_millis(500)).measurement_time(std::time::Duration::from_secs(2)); targets = forward, act, train_step }
+criterion_group! { name = all; config = Criterion::default().sample_size(20).warm_up_time(std::time::Duration::from_millis(500)).measurement_time(std::time::Duration::from_secs(2)); targets = forward, act, latents, train_step }
 criterion_main!(all);
