@@ -28,14 +28,17 @@ RESETS: list[int | None] = []
 
 
 class Lasting(gymnasium.Env[Any, Any]):
-    """A wind that is drawn once a session and is 1 stronger in each of its episodes, which have 3 to 5 steps."""
+    """A wind that is drawn once a session and is stronger by `gain` in each of its episodes, which have 3 to 5 steps."""
 
     observation_space, action_space = spaces.Box(-9.0, 9.0, (4,)), spaces.Box(-1.0, 1.0, (2,))
+
+    def __init__(self, gain: float = 1.0) -> None:
+        self.gain = gain
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         RESETS.append(seed)
-        self.wind = self.np_random.normal() if seed is not None else self.wind + 1
+        self.wind = self.np_random.normal() if seed is not None else self.wind + self.gain
         self.steps_left = self.np_random.integers(3, 6)
         self.place = self.np_random.uniform(-1, 1, size=4)
         return self.place, {}
@@ -224,6 +227,21 @@ def test_the_command_evaluates_in_sessions(address: str, tmp_path: Path, capsys:
     assert [row["sessions"] for row in kept["by_episode"]] == [4, 3, 3]
     assert kept["by_episode"][0] == forgotten["by_episode"][0] and kept["returns"][1] != forgotten["returns"][1]
     assert {row["episode"] for row in kept["readout"]} == {"first", "later"}
+
+
+def test_the_environment_has_its_options(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`cheetah-vel-e` could not be told to have lilac's speeds, which are what lasts there over episodes."""
+    words = ["--env", "Lasting-v0", "--models", "tiny", "--url", address, "--episodes", "2", "--session-episodes", "2"]
+    stored = []
+    for flags in ([], ["--env-option", "gain=5"]):
+        assert evaluate_command.main([*words, *flags, "--json", str(tmp_path / "a.json")]) == 0
+        stored.append(json.loads((tmp_path / "a.json").read_text())[0])
+    plain, strong = stored
+    assert strong["env_options"] == {"gain": 5} and "env_options" not in plain
+    assert strong["returns"][0] == plain["returns"][0] and strong["returns"][1] != plain["returns"][1]
+    capsys.readouterr()
+    assert evaluate_command.main(["--env", "Lasting-v0", "--env-option", "gains=5", "--url", "127.0.0.1:1", "--wait", "0"]) == 1
+    assert "gains" in capsys.readouterr().err
 
 
 def test_words_that_make_no_sessions_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ada_diffuser.commands import add_environment_arguments, import_environments, parse_settings, run_command
+from ada_diffuser.commands import add_environment_arguments, environment_options, import_environments, run_command
 from ada_diffuser.commands.outputs import check_output
 from ada_diffuser.commands.progress import progress
 
@@ -152,21 +152,13 @@ def _plan(args: argparse.Namespace) -> Job:
     environments = import_environments()
     from ada_diffuser.collect import Job
 
-    options = {name: _value(text) for name, text in parse_settings(args.option).items()}
+    options = environment_options(args.option)
     env = environments.make(args.env, episode_steps=args.episode_steps, **options)
     noise = _noise(args.action_noise) if args.action_noise else environments.action_noise(env)
     env_id = args.env if ":" in args.env else env.spec.id
     return Job(
         env_id, options, args.episodes, noise, args.seed, args.episode_steps, args.blind, args.play, session_episodes=args.session_episodes
     )
-
-
-def _value(text: str) -> Any:
-    """JSON where it is JSON, else the word itself."""
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        return text
 
 
 def _noise(text: str) -> tuple[float, ...]:

@@ -103,7 +103,7 @@ def _model_seed(seed: int, index: int) -> int:
 def _open_lanes(client: Client, trial: Trial, stack: ExitStack) -> list[_Lane]:
     lanes = []
     for seed, _ in trial.sessions[: trial.vector]:
-        env = environments.make(trial.env, episode_steps=trial.episode_steps)
+        env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
         stack.callback(env.close)
         session = stack.enter_context(client.open_session(trial.model, seed=seed, options=trial.options))
         _check_fit(trial.env, env, session.model)
@@ -116,7 +116,7 @@ def check(client: Client, trial: Trial) -> int:
 
     Returns the steps of an episode at most.
     """
-    env = environments.make(trial.env, episode_steps=trial.episode_steps)
+    env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
     with closing(env), client.open_session(trial.model, seed=trial.seed, options=trial.options) as session:
         _check_fit(trial.env, env, session.model)
         return environments.steps_max(env)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -36,10 +36,16 @@ class Trial:
     session_episodes: int = 1
     #: Whether the model forgets its history between them all the same.
     forget: bool = False
+    #: Keyword arguments of the environment.
+    env_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.vector < 1 or self.session_episodes < 1 or self.seed < 0:
             raise ValueError("episodes, vector and session_episodes must be at least 1, and the seed at least 0")
+
+    def env_options_as_json(self) -> dict[str, Any]:
+        """Nothing where there are none."""
+        return {"env_options": dict(self.env_options)} if self.env_options else {}
 
     @property
     def sessions(self) -> list[tuple[int, int]]:
@@ -205,6 +211,7 @@ class Evaluation:
         """Everything that a report needs, per-episode returns included."""
         return {
             "env": self.trial.env,
+            **self.trial.env_options_as_json(),
             "model": self.model.name,
             "model_digest": self.model.digest,
             "seed": self.trial.seed,

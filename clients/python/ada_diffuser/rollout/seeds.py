@@ -53,6 +53,7 @@ class SeedGroup:
         first = self.results[0].trial
         return {
             "env": first.env,
+            **first.env_options_as_json(),
             "model": self.recipe,
             "training_seeds": [result.model.name for result in self.results],
             "seed": first.seed,
