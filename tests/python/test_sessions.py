@@ -1,4 +1,7 @@
-"""Episodes that follow one another: what goes on between them in the environment and in the model, and what is said of them."""
+"""Episodes that follow one another: what goes on between them in the environment and in the model, and what is said of them.
+
+The model is that of the double: whether one may keep its history depends on what it was trained on, and here it is to be seen.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from fake_server import Core, serving
 from gymnasium import spaces
 
 from ada_diffuser import Client
-from ada_diffuser.client import Session
 from ada_diffuser.commands import evaluate as evaluate_command
 from ada_diffuser.messages import Missing, Model, SamplerOptions, Timings, Trained
 from ada_diffuser.rollout import ActLog, Episode, Evaluation, Trial, evaluate
@@ -30,7 +33,7 @@ RESETS: list[int | None] = []
 class Lasting(gymnasium.Env[Any, Any]):
     """A wind that is drawn once a session and is stronger by `gain` in each of its episodes, which have 3 to 5 steps."""
 
-    observation_space, action_space = spaces.Box(-9.0, 9.0, (4,)), spaces.Box(-1.0, 1.0, (2,))
+    observation_space, action_space = spaces.Box(-9.0, 9.0, (2,)), spaces.Box(-1.0, 1.0, (2,))
 
     def __init__(self, gain: float = 1.0) -> None:
         self.gain = gain
@@ -40,12 +43,12 @@ class Lasting(gymnasium.Env[Any, Any]):
         RESETS.append(seed)
         self.wind = self.np_random.normal() if seed is not None else self.wind + self.gain
         self.steps_left = self.np_random.integers(3, 6)
-        self.place = self.np_random.uniform(-1, 1, size=4)
+        self.place = self.np_random.uniform(-1, 1, size=2)
         return self.place, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.steps_left -= 1
-        self.place = self.place + 0.1 * np.tile(action, 2) + 0.1 * self.wind
+        self.place = self.place + 0.1 * np.clip(action, -1, 1) + 0.1 * self.wind
         return self.place, -float(np.linalg.norm(self.place)), self.steps_left == 0, False, {"context": np.array([self.wind])}
 
 
@@ -57,11 +60,22 @@ def registered() -> Iterator[None]:
     gymnasium.registry.pop("Lasting-v0")
 
 
-SEVEN = Trial("Lasting-v0", "tiny", episodes=7, seed=40, session_episodes=3, options=SamplerOptions(temperature=1.0))
+@pytest.fixture
+def core() -> Core:
+    return Core()
 
 
-def ran(address: str, trial: Trial) -> Evaluation:
-    with Client(f"grpc://{address}") as client:
+@pytest.fixture
+def url(core: Core) -> Iterator[str]:
+    with serving(core, "grpc") as url:
+        yield url
+
+
+SEVEN = Trial("Lasting-v0", episodes=7, seed=40, session_episodes=3)
+
+
+def ran(url: str, trial: Trial) -> Evaluation:
+    with Client(url) as client:
         return evaluate(client, trial)
 
 
@@ -70,19 +84,11 @@ def winds(result: Evaluation) -> list[float]:
 
 
 @pytest.mark.parametrize("forget", [False, True])
-def test_environment_and_model_go_on_within_a_session(address: str, forget: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[tuple[int | None, bool]] = []
-    reset = Session.reset
-
-    def seen(self: Session, seed: int | None = None, *, keep_history: bool = False) -> None:
-        told.append((seed, keep_history))
-        reset(self, seed, keep_history=keep_history)
-
-    monkeypatch.setattr(Session, "reset", seen)
-    result = ran(address, replace(SEVEN, forget=forget))
+def test_environment_and_model_go_on_within_a_session(core: Core, url: str, forget: bool) -> None:
+    result = ran(url, replace(SEVEN, forget=forget))
     assert RESETS == [40, None, None, 41, None, None, 42]
-    assert [keep for _, keep in told] == [not forget and place > 0 for place in (0, 1, 2, 0, 1, 2, 0)]
-    seeds = [seed for seed, _ in told]
+    assert [keep for _, _, keep in core.resets] == [not forget and place > 0 for place in (0, 1, 2, 0, 1, 2, 0)]
+    seeds = [seed for _, seed, _ in core.resets]
     assert seeds[::3] == [40, 41, 42] and len(set(seeds)) == 7, "each episode has noise of its own"
     assert [(episode.seed, episode.index) for episode in result.episodes] == [
         *((40, 0), (40, 1), (40, 2), (41, 0), (41, 1), (41, 2), (42, 0))
@@ -90,23 +96,36 @@ def test_environment_and_model_go_on_within_a_session(address: str, forget: bool
     assert np.diff(winds(result)[:3]) == pytest.approx(1) and np.diff(winds(result)[3:6]) == pytest.approx(1)
 
 
-def test_sessions_are_the_same_alone_and_side_by_side(address: str) -> None:
+def test_sessions_are_the_same_alone_and_side_by_side(url: str) -> None:
     """Their episodes have different lengths, so that one session is in its second while another is in its first."""
-    alone = ran(address, SEVEN)
+    alone = ran(url, SEVEN)
     assert len({len(episode.rewards) for episode in alone.episodes}) > 1
     for vector in (2, 9):
-        beside = ran(address, replace(SEVEN, vector=vector))
+        beside = ran(url, replace(SEVEN, vector=vector))
         assert np.array_equal(beside.returns, alone.returns) and winds(beside) == winds(alone)
-    apart = ran(address, replace(SEVEN, episodes=3, session_episodes=1))
+    apart = ran(url, replace(SEVEN, episodes=3, session_episodes=1))
     assert np.array_equal(apart.returns, alone.returns[[0, 3, 6]]), "first episodes have the seeds that episodes by themselves have"
 
 
-def test_a_model_that_forgets_sees_the_same_and_knows_less(address: str) -> None:
-    kept, forgotten = ran(address, SEVEN), ran(address, replace(SEVEN, forget=True))
+def test_a_model_that_forgets_sees_the_same_and_knows_less(url: str) -> None:
+    kept, forgotten = ran(url, SEVEN), ran(url, replace(SEVEN, forget=True))
     assert winds(kept) == winds(forgotten)
+    before = 0
     for one, other in zip(kept.episodes, forgotten.episodes, strict=True):
-        assert np.array_equal(one.states[0], other.states[0])
-        assert np.array_equal(one.latents[0], other.latents[0]) == (one.index == 0), "the first act's latent looks back, or at nothing"
+        before = before if one.index else 0
+        assert [episode.latents[0][0] - 0.5 for episode in (one, other)] == [before, 0], "acts of the session that it looks back on"
+        before += len(one.latents)
+
+
+def test_a_model_that_may_keep_no_history_is_refused_before_the_first_episode(
+    core: Core, url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    core.keeps_history = False
+    words = ["--env", "Lasting-v0", "--url", url, "--episodes", "4", "--session-episodes", "2"]
+    assert evaluate_command.main(words) == 1
+    told = capsys.readouterr()
+    assert "REQUEST_INVALID" in told.err and told.err.count("\n") == 1 and not core.seen and told.out == ""
+    assert evaluate_command.main([*words, "--forget"]) == 0
 
 
 def placed(returns: list[list[float]], name: str = "fake", failed: tuple[int, int] | None = None) -> Evaluation:
@@ -212,26 +231,26 @@ def test_rows_of_a_readout_say_which_episodes() -> None:
     assert "| latent | steps 0 to 39 |" in readout_table([read(alone)], [])
 
 
-def test_the_command_evaluates_in_sessions(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--env", "Lasting-v0", "--models", "tiny", "--url", address, "--episodes", "10", "--session-episodes", "3", "--seed", "40"]
+def test_the_command_evaluates_in_sessions(url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--env", "Lasting-v0", "--url", url, "--episodes", "10", "--session-episodes", "3", "--seed", "40"]
     stored = []
     for name, flags in (("kept", []), ("forgotten", ["--forget", "--markdown"])):
         path = tmp_path / f"{name}.json"
         assert evaluate_command.main([*words, "--readout", "--json", str(path), *flags]) == 0
         told = capsys.readouterr()
-        assert f"| Lasting-v0 | tiny | {name} | 4 |" in told.out and told.out.count("\n\n") == 2
+        assert f"| Lasting-v0 | fake | {name} | 4 |" in told.out and told.out.count("\n\n") == 2
         assert ("by episode" in told.err) != ("--markdown" in flags)
         stored.append(json.loads(path.read_text())[0])
     kept, forgotten = stored
     assert (kept["keep_history"], forgotten["keep_history"]) == (True, False)
     assert [row["sessions"] for row in kept["by_episode"]] == [4, 3, 3]
-    assert kept["by_episode"][0] == forgotten["by_episode"][0] and kept["returns"][1] != forgotten["returns"][1]
+    assert kept["by_episode"] == forgotten["by_episode"] and kept["readout"] != forgotten["readout"], "the double acts blindly"
     assert {row["episode"] for row in kept["readout"]} == {"first", "later"}
 
 
-def test_the_environment_has_its_options(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_environment_has_its_options(url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`cheetah-vel-e` could not be told to have lilac's speeds, which are what lasts there over episodes."""
-    words = ["--env", "Lasting-v0", "--models", "tiny", "--url", address, "--episodes", "2", "--session-episodes", "2"]
+    words = ["--env", "Lasting-v0", "--url", url, "--episodes", "2", "--session-episodes", "2"]
     stored = []
     for flags in ([], ["--env-option", "gain=5"]):
         assert evaluate_command.main([*words, *flags, "--json", str(tmp_path / "a.json")]) == 0

@@ -41,9 +41,10 @@ The standard error is that over episodes, and says nothing of another training. 
   ada-evaluate --env cheetah-wind-s --models a,b --episodes 50 --seed 1000 --set kappa=0,0.1,inf --set streaming=true,false
 
 --session-episodes N runs the episodes in sessions of N that follow one another, over which what is hidden may last: session k has seed
-SEED + k, between its episodes the environment is reset without a seed, and the model goes on looking back on the episodes before. A
-second table has the returns by the episode's place in the session. All standard errors are over sessions then. Where N does not divide
---episodes, the last session is shorter. --forget has the model begin each episode anew, in the same contexts, for comparison.
+SEED + k, between its episodes the environment is reset without a seed, and the model goes on looking back on the episodes before, which
+it must have been trained to do. A second table has the returns by the episode's place in the session. All standard errors are over
+sessions then. Where N does not divide --episodes, the last session is shorter. --forget has the model begin each episode anew, in the same
+contexts: for comparison, and for a model that was trained on episodes one by one.
 
   ada-evaluate --env cheetah-wind-e --models a --episodes 48 --session-episodes 8
   ada-evaluate --env cheetah-wind-e --models a --episodes 48 --session-episodes 8 --forget

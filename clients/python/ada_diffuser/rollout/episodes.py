@@ -119,6 +119,8 @@ def check(client: Client, trial: Trial) -> int:
     env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
     with closing(env), client.open_session(trial.model, seed=trial.seed, options=trial.options) as session:
         _check_fit(trial.env, env, session.model)
+        if trial.session_episodes > 1 and not trial.forget:
+            session.reset(trial.seed, keep_history=True)  # refused where the model was trained on episodes one by one
         return environments.steps_max(env)
 
 
