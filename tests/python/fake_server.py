@@ -1,6 +1,7 @@
 """A double of the server for faults that a real one shows only by chance: the step protocol and both faces, small.
 
-An act's actions are `step + executed rewards`, so a test sees what arrived. Faults are scripted: each act takes the next one.
+An act's actions are `step + executed rewards`, so a test sees what arrived; its latent is the number of acts of earlier episodes that it
+looks back on, and a half. Faults are scripted: each act takes the next one.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ CODES = {
     "ENGINE_PANIC": (grpc.StatusCode.INTERNAL, 500),
     "SESSION_NOT_FOUND": (grpc.StatusCode.NOT_FOUND, 404),
     "TOO_LARGE": (grpc.StatusCode.RESOURCE_EXHAUSTED, 413),
+    "REQUEST_INVALID": (grpc.StatusCode.INVALID_ARGUMENT, 400),
 }
 
 
@@ -41,6 +43,8 @@ class Refusal(Exception):
 class Session:
     committed: int = 0
     last: tuple[object, list[float]] | None = None
+    #: Acts of the episodes before.
+    kept: int = 0
 
 
 @dataclass
@@ -51,6 +55,9 @@ class Core:
     sessions: dict[str, Session] = field(default_factory=dict)
     #: Every act that arrived: (session, step, observation).
     seen: list[tuple[str, int, object]] = field(default_factory=list)
+    #: Every reset that arrived: (session, seed, whether the history is kept), and whether it may be.
+    resets: list[tuple[str, int | None, bool]] = field(default_factory=list)
+    keeps_history: bool = True
     #: Acts that a batch may hold, and the length of each batch that arrived.
     batch_len_max: int = 256
     batches: list[int] = field(default_factory=list)
@@ -61,6 +68,13 @@ class Core:
             name = f"s{len(self.sessions)}"
             self.sessions[name] = Session()
             return name
+
+    def reset(self, name: str, seed: int | None, keep_history: bool) -> None:
+        self.resets.append((name, seed, keep_history))
+        if keep_history and not self.keeps_history:
+            raise Refusal("REQUEST_INVALID")
+        old = self.sessions[name]
+        self.sessions[name] = Session(kept=old.kept + old.committed if keep_history else 0)
 
     def batch(self, length: int) -> None:
         self.batches.append(length)
@@ -98,11 +112,11 @@ MODEL = {
 }
 
 
-def _chunk(name: str, step: int, action: list[float], replayed: bool) -> dict:
+def _chunk(name: str, step: int, action: list[float], replayed: bool, kept: int) -> dict:
     timings = {"queue_us": 1, "compute_us": 2, "commit_us": 3, "total_us": 6}
     return {
         **{"session_id": name, "step": step, "replayed": replayed, "actions": [action, action, action]},
-        **{"latent_mean": [0.5], "latent_log_var": [-1.0], "predicted_state": [0.0, 0.0], "evaluations": 3},
+        **{"latent_mean": [kept + 0.5], "latent_log_var": [-1.0], "predicted_state": [0.0, 0.0], "evaluations": 3},
         **{"start": "warm", "renoised_rungs": 0, "timings": timings, "model": "fake", "model_digest": "0" * 64, "degraded": False},
     }
 
@@ -127,7 +141,10 @@ class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
         return agent_pb2.OpenSessionResponse(session=session, model=_model())
 
     def ResetSession(self, request, context):  # noqa: N802
-        self.core.sessions[request.session_id] = Session()
+        try:
+            self.core.reset(request.session_id, request.seed if request.HasField("seed") else None, request.keep_history)
+        except Refusal as refusal:
+            self._refuse(refusal, context)
         return agent_pb2.ResetSessionResponse(session=agent_pb2.Session(session_id=request.session_id, seed=request.seed))
 
     def GetSession(self, request, context):  # noqa: N802
@@ -177,7 +194,7 @@ class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
         executed = [{"reward": done.reward} if done.HasField("reward") else {} for done in request.observation.executed]
         observation = {"state": list(request.observation.state), "executed": executed}
         action, replayed = self.core.act(request.session_id, request.step, observation)
-        chunk = _chunk(request.session_id, request.step, action, replayed)
+        chunk = _chunk(request.session_id, request.step, action, replayed, self.core.sessions[request.session_id].kept)
         actions = agent_pb2.Matrix(values=action * 3, rows=3, columns=2)
         return agent_pb2.ActResponse(**{**chunk, "actions": actions, "start": "START_WARM"})
 
@@ -215,7 +232,7 @@ class HttpFake(BaseHTTPRequestHandler):
             return self._answer(200, {"results": [self._result(act) for act in body["acts"]]})
         name, verb = self.path.split("/")[3:5]
         if verb == "reset":
-            self.core.sessions[name] = Session()
+            self.core.reset(name, body.get("seed"), body.get("keep_history", False))
             return self._answer(200, {"session": _session(name, 0)})
         result = self._result({"session_id": name, **body})
         if "error" in result:
@@ -229,7 +246,7 @@ class HttpFake(BaseHTTPRequestHandler):
         except Refusal as refusal:
             facts = {name: value for name, value in vars(refusal).items() if value not in (None, "")}
             return {**known, "error": {"status": CODES[refusal.reason][1], "detail": "refused", **facts}}
-        return {**known, "response": _chunk(act["session_id"], act["step"], action, replayed)}
+        return {**known, "response": _chunk(act["session_id"], act["step"], action, replayed, self.core.sessions[act["session_id"]].kept)}
 
     def _answer(self, status: int, body: dict | None) -> None:
         text = b"" if body is None else json.dumps(body).encode()

@@ -192,10 +192,12 @@ def test_the_command_chooses_tells_and_writes(tmp_path: Path, capsys: pytest.Cap
     (tmp_path / "temporary").mkdir()
     out = tmp_path / "new/chosen"
     out.parent.mkdir()
-    assert evaluate_command.main(choose(*SMALL, "--json", str(tmp_path / "a.json"), "--write", str(out))) == 0
+    words = choose(*SMALL, "--env-option", "sigma=0.5", "--json", str(tmp_path / "a.json"), "--write", str(out))
+    assert evaluate_command.main(words) == 0
     told = capsys.readouterr()
     assert told.out.count("\n| ") == 3 and "**chosen**" in told.out
     stored = json.loads((tmp_path / "a.json").read_text())
+    assert stored["env_options"] == {"sigma": 0.5}
     assert stored["seed"] == 5000 and len(stored["settings"]) == 3 and all(len(one["returns"]) == 3 for one in stored["settings"])
     assert stored["command"] in told.out and stored["reason"] in told.out
     assert [one["verdict"] for one in stored["settings"]].count("chosen") == 1
@@ -217,6 +219,7 @@ def test_settings_are_checked_before_the_first_episode(tmp_path: Path, capsys: p
         (choose("--set", "kapa=1"), "kapa"),
         (choose("--episodes", "1"), "at least 2 episodes"),
         (choose("--models", "tiny"), "--models"),
+        (choose("--env-option", "sigmas=1"), "sigmas"),
         (choose("--readout"), "two commands"),
         (choose("--write", str(tmp_path / "file")), "is a file"),
         ([*choose(), "--choose", str(tmp_path)], "ada-trainer inspect:"),

@@ -16,6 +16,7 @@ from ada_diffuser.collect import Job, collect
 from ada_diffuser.commands.collect import main
 from ada_diffuser.dataset import card_path, load_episodes
 from ada_diffuser.experts import formula_of, load_expert
+from ada_diffuser.experts.policy import CalledExpert
 
 TINY = ["--episodes", "3", "--quiet", "--expert-searches", "1", "--expert-iterations", "1"]
 
@@ -166,6 +167,67 @@ def test_without_blind_episodes_nothing_is_said_of_them(tmp_path):
     assert "blind" not in json.loads(card_path(tmp_path / "x.h5").read_text())
 
 
+def wind_phase(winds):
+    """`phi` of the winds of Cheetah-Wind-E in episodes 0, 1, ... of a session; that they have one is asserted."""
+    turn = 0.8 * np.arange(len(winds))
+    (cosine, sine), *_ = np.linalg.lstsq(5 * np.column_stack([np.sin(turn), np.cos(turn)]), winds - 10, rcond=None)
+    phase = np.arctan2(sine, cosine)
+    assert np.allclose(winds, 10 + 5 * np.sin(turn + phase), atol=1e-4), "not the winds of one session"
+    return phase
+
+
+def test_sessions_follow_one_another_and_the_file_says_which_episodes_do(tmp_path):
+    path = tmp_path / "x.h5"
+    flags = ["--env", "cheetah-wind-e", "--expert", "random", "--episode-steps", "2", "--episodes", "11", "--session-episodes", "4"]
+    assert run(path, *flags) == 0
+    with h5py.File(path) as file:
+        session = file["infos/session"][()]
+    assert session.dtype == np.int64 and session.tolist() == [0] * 8 + [1] * 8 + [2] * 6, "one a step; the last session is shorter"
+    winds = load_episodes(path).context[::2, 0].astype(np.float64)
+    phases = [wind_phase(winds[first : first + 4]) for first in (0, 4, 8)]
+    assert len(set(np.round(phases, 2))) == 3
+    with pytest.raises(AssertionError, match="not the winds of one session"):
+        wind_phase(winds)  # a session that went on would seem to have another phase, too
+    assert json.loads(card_path(path).read_text())["session_episodes"] == 4
+    assert run(tmp_path / "again.h5", *flags) == 0
+    assert path.read_bytes() == (tmp_path / "again.h5").read_bytes()
+
+
+@pytest.mark.parametrize(("flags", "begins"), [([], [0]), (["--session-episodes", "2"], [0, 2, 4]), (["--session-episodes", "9"], [0])])
+def test_a_seed_is_given_where_a_session_begins_and_nowhere_else(flags, begins, tmp_path, monkeypatch):
+    seeds, reset = [], environments.PointWindS.reset
+
+    def seen(self, *, seed=None, options=None):
+        seeds.append(seed)
+        return reset(self, seed=seed, options=options)
+
+    monkeypatch.setattr(environments.PointWindS, "reset", seen)
+    assert run(tmp_path / "x.h5", "--env", "point-wind-s", "--episodes", "5", *flags) == 0
+    given = [seed for seed in seeds if seed is not None]
+    assert [episode for episode, seed in enumerate(seeds) if seed is not None] == begins and len(set(given)) == len(begins)
+    with h5py.File(tmp_path / "x.h5") as file:
+        assert ("session" in file["infos"]) == bool(flags)
+    assert ("session_episodes" in json.loads(card_path(tmp_path / "x.h5").read_text())) == bool(flags)
+
+
+def test_a_session_is_blind_or_play_as_a_whole_and_the_other_world_lasts_as_long():
+    told = []
+
+    def expert(observation, context):
+        told.append(context[0])
+        return np.zeros(6)
+
+    job = Job("cheetah-wind-e", {}, 36, (0.0,), seed=2, episode_steps=1, blind=1 / 6, play=0.5, session_episodes=3)
+    episodes, _ = collect(job, CalledExpert(expert, {}), blind=CalledExpert(expert, {}))
+    told, true = np.array(told, np.float64).reshape(12, 3), episodes.context.astype(np.float64).reshape(12, 3)
+    blind, play = episodes.blind.reshape(12, 3), episodes.play.reshape(12, 3)
+    assert (blind == blind[:, :1]).all() and (play == play[:, :1]).all() and not (blind & play).any()
+    assert (blind[:, 0].sum(), play[:, 0].sum()) == (2, 6), "shares of the sessions"
+    assert np.array_equal(told[~play[:, 0]], true[~play[:, 0]])
+    other = [wind_phase(row) for row in told[play[:, 0]]]
+    assert len(set(np.round(other, 2))) == 6 and not np.isclose(told[play[:, 0]], true[play[:, 0]]).all(axis=1).any()
+
+
 def test_a_blind_expert_is_searched_for_kept_and_used_again(tmp_path):
     path, cache = tmp_path / "x.h5", tmp_path / "x.blind.npz"
     assert run(path, "--env", "cheetah-vel-e", "--blind", "1") == 0
@@ -191,6 +253,7 @@ def test_a_blind_expert_is_searched_for_kept_and_used_again(tmp_path):
         (["--env", "Pendulum-v1", "--expert", "random", "--blind", "0.5"], "--blind-expert"),
         (["--env", "cheetah-rain"], "cheetah-wind-s"),
         (["--env", "point-wind-s", "--episodes", "0"], "--episodes"),
+        (["--env", "point-wind-s", "--session-episodes", "0"], "--session-episodes must be at least 1"),
         (["--env", "point-wind-s", "--option", "sigma"], "NAME=VALUE"),
         (["--env", "point-wind-s", "--option", "sigmas=1"], "sigmas"),
         (["--env", "point-wind-s", "--action-noise", "a,b"], "--action-noise"),

@@ -366,6 +366,25 @@ def test_vel_e_draws_from_its_targets():
     assert np.allclose(speeds(targets="lilac"), [1.5 + 1.5 * math.sin(0.5 * i) for i in range(31)], atol=1e-6)
 
 
+def test_vel_e_draws_the_phase_of_lilac_in_each_session_where_it_is_wanted():
+    """With the paper's phase every session has the same speeds, and another world's are no false ones."""
+
+    def session(seed, **options):
+        env = environments.make("cheetah-vel-e", targets="lilac", **options).unwrapped
+        return np.array([env.reset(seed=seed)[1]["context"][0]] + [env.reset()[1]["context"][0] for _ in range(12)], np.float64)
+
+    rows = 1.5 * np.column_stack([np.sin(0.5 * np.arange(13)), np.cos(0.5 * np.arange(13))])
+    phases = []
+    for seed in (0, 1):
+        drawn = session(seed, phase=None)
+        (cosine, sine), *_ = np.linalg.lstsq(rows, drawn - 1.5, rcond=None)
+        phases.append(np.arctan2(sine, cosine))
+        assert np.allclose(drawn, 1.5 + 1.5 * np.sin(0.5 * np.arange(13) + phases[-1]), atol=1e-6), "one phase in all of it"
+    assert abs(phases[0] - phases[1]) > 0.01
+    wave = 1.5 + 1.5 * np.sin(0.5 * np.arange(13) + 2.0)
+    assert np.allclose(session(0, phase=2.0), wave, atol=1e-6) and np.allclose(session(1, phase=2.0), wave, atol=1e-6)
+
+
 @pytest.mark.parametrize("name", environments.NAMES)
 def test_a_return_of_standing_still_counts_as_failed_and_an_experts_does_not(name):
     env = environments.make(name).unwrapped

@@ -29,6 +29,8 @@ class Job:
         blind: share of the episodes, 0 to 1, that an expert flies which does not see the context; drawn by the seed.
         play: share of the episodes that the expert flies told the context of another world: its actions say nothing of the true one, and
             are nothing to imitate.
+        session_episodes: after so many episodes the environment is reset with a seed, and another session begins; the last one has what is
+            left. A session is blind, or play, as a whole. None: all episodes are one session, and each is drawn by itself.
     """
 
     env: str
@@ -39,23 +41,31 @@ class Job:
     episode_steps: int | None = None
     blind: float = 0.0
     play: float = 0.0
+    session_episodes: int | None = None
+
+    def sessions(self) -> np.ndarray:
+        """The number of each episode's session, (episodes,) int64."""
+        return np.arange(self.episodes, dtype=np.int64) // (self.session_episodes or self.episodes)
 
     def flown_blind(self) -> np.ndarray:
         """Which episodes, (episodes,) bool: their number is the share's, rounded; which ones has its own stream of chance."""
-        return self._order() < round(self.blind * self.episodes)
+        return self._drawn(self.blind)
 
     def played(self) -> np.ndarray:
         """Which episodes are play, (episodes,) bool; none of them is flown blind."""
-        return ~self.flown_blind() & (self._order() < round((self.blind + self.play) * self.episodes))
+        return ~self.flown_blind() & self._drawn(self.blind + self.play)
 
-    def _order(self) -> np.ndarray:
-        return np.random.default_rng([self.seed, 4]).permutation(np.arange(self.episodes))
+    def _drawn(self, share: float) -> np.ndarray:
+        """(episodes,) bool; who is drawn for a share is drawn for a larger one too."""
+        groups = np.arange(self.episodes) if self.session_episodes is None else self.sessions()
+        count = int(groups[-1]) + 1
+        return (np.random.default_rng([self.seed, 4]).permutation(np.arange(count)) < round(share * count))[groups]
 
 
 def collect(
     job: Job, expert: Expert, progress: Callable[[int], object] = lambda episodes: None, *, blind: Expert | None = None
 ) -> tuple[Episodes, np.ndarray]:
-    """Fly the episodes of one session; returns them and which of them failed, (episodes,) bool. A pure function of its arguments.
+    """Fly the episodes; returns them and which of them failed, (episodes,) bool. A pure function of its arguments.
 
     `progress` is called with the number of episodes just flown. `blind` flies the share that the job wants flown blind.
     """
@@ -63,25 +73,39 @@ def collect(
     if blind is None and flown_blind.any():
         raise ValueError("a job with a blind share needs a blind expert")
     env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
-    env_seed, noise_seed = np.random.SeedSequence(job.seed).generate_state(2)
-    rng = np.random.default_rng(noise_seed)
+    rng = np.random.default_rng(np.random.SeedSequence(job.seed).generate_state(2)[1])
+    sessions, seeds = job.sessions(), _seeds(job)
     other = _OtherWorld(job) if played.any() else None
     flown, failed = [], np.zeros(job.episodes, np.bool_)
     for episode, (is_blind, is_play) in enumerate(zip(flown_blind, played, strict=True)):
         std = float(rng.choice(job.noise))
         pilot, told = blind if is_blind else expert, other if is_play else None
-        flown.append(_fly(env, pilot, std, rng, int(env_seed) if episode == 0 else None, told))
+        flown.append(_fly(env, pilot, std, rng, seeds[episode], told))
         failed[episode] = environments.failed(env, float(flown[-1].rewards.sum()))
         if job.blind:
             flown[-1].blind = np.full(len(flown[-1].rewards), is_blind)
         if job.play:
             flown[-1].play = np.full(len(flown[-1].rewards), is_play)
+        if job.session_episodes:
+            flown[-1].session = np.full(len(flown[-1].rewards), sessions[episode])
         progress(1)
     env.close()
     if other:
         other.close()
     columns = {name: [getattr(e, name) for e in flown] for name in Episodes.__dataclass_fields__}
     return Episodes(**{name: None if parts[0] is None else np.concatenate(parts) for name, parts in columns.items()}), failed
+
+
+def _seeds(job: Job) -> list[int | None]:
+    """What the environment is reset with before each episode: a seed where a session begins, nothing where it goes on."""
+    seeds: list[int | None] = [None] * job.episodes
+    if job.session_episodes is None:
+        seeds[0] = int(np.random.SeedSequence(job.seed).generate_state(2)[0])
+        return seeds
+    rng = np.random.default_rng([job.seed, 6])
+    for first in range(0, job.episodes, job.session_episodes):
+        seeds[first] = int(rng.integers(2**31))
+    return seeds
 
 
 def _check_fit(env: gym.Env, expert: Expert) -> None:
@@ -103,15 +127,16 @@ def _context(env: gym.Env) -> np.ndarray | None:
 
 class _OtherWorld:
     """Another episode of the same environment, under the same actions: its context is drawn as the true one is, and has nothing to do with
-    it."""
+    it. Where the job has sessions it goes through one of its own meanwhile, so that the false context lasts as the true one does."""
 
     def __init__(self, job: Job) -> None:
         self._env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
         self._rng, self._ended = np.random.default_rng([job.seed, 5]), True
+        self._lasts = job.session_episodes is not None
 
-    def begin(self) -> None:
-        # A session of its own, so that what lasts over episodes is drawn anew too.
-        self._env.reset(seed=int(self._rng.integers(2**31)))
+    def begin(self, *, session: bool) -> None:
+        """An episode, and a session where the true one begins; without sessions each time, so that all of the context is drawn anew."""
+        self._env.reset(seed=int(self._rng.integers(2**31)) if session or not self._lasts else None)
         self._ended = False
 
     @property
@@ -133,7 +158,7 @@ def _fly(
     """One episode with action noise `std`; the expert is told the context of the `other` world, if there is one."""
     observation, _ = env.reset(seed=seed)
     if other:
-        other.begin()
+        other.begin(session=seed is not None)
     _check_fit(env, expert)  # not before: what a class draws in `reset` need not be there earlier
     low, high = env.action_space.low, env.action_space.high
     steps: list[tuple[Any, ...]] = []
@@ -162,6 +187,7 @@ def data_card(job: Job, expert: Expert, episodes: Episodes, failed: np.ndarray, 
         "format": "d4rl-hdf5",
         "environment": {"id": job.env, "options": job.options} | ({"episode_steps": job.episode_steps} if job.episode_steps else {}),
         "episodes": len(returns),
+        **({"session_episodes": job.session_episodes} if job.session_episodes else {}),
         "steps": len(episodes.rewards),
         "seed": job.seed,
         "action_noise": list(job.noise),

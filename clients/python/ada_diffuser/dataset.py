@@ -27,6 +27,8 @@ class Episodes:
         context: (N, context), float32; what was hidden while the action was executed; None where the environment tells none.
         blind: (N,), bool; whether the episode was flown without sight of the context; None where none was meant to be.
         play: (N,), bool; whether it shows what comes of actions and is nothing to imitate; None where all is to be imitated.
+        session: (N,), int64; episodes with the same number follow one another, and what is hidden may outlast them; None where none was
+            meant to.
     """
 
     observations: np.ndarray
@@ -38,6 +40,7 @@ class Episodes:
     context: np.ndarray | None = None
     blind: np.ndarray | None = None
     play: np.ndarray | None = None
+    session: np.ndarray | None = None
 
     def returns(self) -> np.ndarray:
         """Undiscounted return of each episode, shape (episodes,), float64."""
@@ -61,9 +64,10 @@ _PATHS = {
     "action_noise": "infos/action_noise",
     "blind": "infos/blind",
     "play": "infos/play",
+    "session": "infos/session",
 }
 """Field of `Episodes` -> path in the file, in the order of writing."""
-_OPTIONAL = ("context", "blind", "play")
+_OPTIONAL = ("context", "blind", "play", "session")
 
 
 def save_episodes(episodes: Episodes, path: Path) -> str:

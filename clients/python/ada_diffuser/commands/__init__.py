@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import os
 import sys
 from collections.abc import Callable, Sequence
 from types import ModuleType
+from typing import Any
 
 from ada_diffuser.errors import AdaError
 
@@ -62,6 +64,18 @@ def parse_settings(words: Sequence[str]) -> dict[str, str]:
     return settings
 
 
+def environment_options(words: Sequence[str]) -> dict[str, Any]:
+    """`["gain=2", "targets=lilac"]` as keyword arguments of an environment: values are JSON where they are JSON, else the word itself."""
+    return {name: _value(text) for name, text in parse_settings(words).items()}
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
 def run_command(program: str, run: Callable[[], object], *, status: int = 1) -> int:
     """Runs the body of a command: 0; `status` with one sentence on stderr for what the user can mend; 130 when interrupted."""
     for stream in (sys.stdout, sys.stderr):
@@ -96,9 +110,9 @@ def import_environments() -> ModuleType:
     return environments
 
 
-def check_environment(arguments: argparse.Namespace) -> None:
-    """Raises `ValueError` for an environment that cannot be made, before a server is waited for."""
-    import_environments().make(arguments.env, episode_steps=arguments.episode_steps).close()
+def check_environment(arguments: argparse.Namespace, **options: Any) -> None:
+    """Raises `ValueError` for an environment that cannot be made with these options, before a server is waited for."""
+    import_environments().make(arguments.env, episode_steps=arguments.episode_steps, **options).close()
 
 
 def _sentence(error: Exception) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ada_diffuser.client import Client
-from ada_diffuser.commands import check_environment, parse_settings
+from ada_diffuser.commands import check_environment, environment_options, parse_settings
 from ada_diffuser.commands.outputs import check_output, save_json
 from ada_diffuser.commands.progress import progress
 from ada_diffuser.commands.variants import Programs, defaults_line, served
@@ -64,7 +64,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--write {out} is a file, and a directory is to be written")
     if out and out.resolve() == checkpoint.resolve() and (out / "training").exists():
         raise ValueError(f"--write {out}: the next `run` would write the recipe's defaults again; name another directory")
-    check_environment(arguments)
+    check_environment(arguments, **environment_options(arguments.env_option))
 
 
 def _restart(setting: Setting, facts: Facts) -> tuple[str, ...]:
@@ -113,6 +113,7 @@ class _Runner:
             setting.options,
             asked.episode_steps,
             withhold_rewards=asked.withhold_rewards,
+            env_options=environment_options(asked.env_option),
         )
 
 
@@ -123,7 +124,11 @@ def _as_json(arguments: argparse.Namespace, digest: str, choice: Choice, line: s
     def of(one: Tried) -> dict[str, Any]:
         told = one.result.as_json()
         gap = choice.gap(one)
-        kept = {name: value for name, value in told.items() if name not in ("env", "model", "model_digest", "vector", "withhold_rewards")}
+        kept = {
+            name: value
+            for name, value in told.items()
+            if name not in ("env", "env_options", "model", "model_digest", "vector", "withhold_rewards")
+        }
         return {
             "setting": plain_options(one.setting.values()),
             "verdict": choice.verdict(one),
@@ -135,6 +140,7 @@ def _as_json(arguments: argparse.Namespace, digest: str, choice: Choice, line: s
 
     return {
         "env": arguments.env,
+        **choice.reference.result.trial.env_options_as_json(),
         "checkpoint": str(arguments.choose),
         "checkpoint_digest": digest,
         "seed": arguments.seed,

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ada_diffuser.commands import add_environment_arguments, import_environments, parse_settings, run_command
+from ada_diffuser.commands import add_environment_arguments, environment_options, import_environments, run_command
 from ada_diffuser.commands.outputs import check_output
 from ada_diffuser.commands.progress import progress
 
@@ -37,7 +37,13 @@ infos/blind tells those episodes, the card has the returns of both kinds.
 
 --play S has a share S of the episodes flown by the expert while it is told the context of another world, drawn as the true one is. Its
 actions then say nothing of the true context, so that what comes of them does: data to find what is hidden in, and nothing to
-imitate. infos/play tells those episodes; ada-trainer has no planner imitate them."""
+imitate. infos/play tells those episodes; ada-trainer has no planner imitate them.
+
+--session-episodes N makes sessions of N episodes that follow one another: the environment is reset with a seed where a session begins
+and without one where it goes on, so that what is hidden may outlast an episode, as the wind of cheetah-wind-e does. infos/session has the
+number of the session at each step. --blind and --play are then shares of the sessions, each of which is of one kind throughout. Where
+N does not divide --episodes, the last session is shorter. Without it the environment is given a seed once, and nothing is written of
+sessions."""
 
 _EXAMPLES = """\
 examples:
@@ -48,6 +54,7 @@ examples:
   ada-collect --env cheetah-wind-s --expert data/cheetah-wind-s.expert.npz --seed 7 --out data/more.h5
   ada-collect --env hopper-gravity-e --blind 0.5 --action-noise 0.1,0.2 --out data/mixed.h5
   ada-collect --env cheetah-gale-s --play 0.75 --episodes 1200 --out data/gale.h5
+  ada-collect --env cheetah-wind-e --session-episodes 10 --play 0.5 --episodes 600 --out data/sessions.h5
   ada-collect --env my_module:Mine-v0 --expert my_module:policy --out data/mine.h5
 """
 
@@ -84,6 +91,9 @@ def _parser() -> argparse.ArgumentParser:
     add_environment_arguments(parser)
     parser.add_argument("--out", required=True, type=Path, metavar="X.h5", help="the file to write; its folder is made")
     parser.add_argument("--episodes", type=int, default=300, metavar="N", help="how many (default 300)")
+    parser.add_argument(
+        "--session-episodes", type=int, metavar="N", help="another session begins every N episodes, and infos/session numbers them"
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random here (default 0)")
     parser.add_argument(
         "--option", action="append", default=[], metavar="NAME=VALUE", help="option of the environment, value as JSON; repeatable"
@@ -115,7 +125,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
-    for flag, least in (("episodes", 1), ("seed", 0), ("expert_seed", 0), ("expert_searches", 1), ("expert_iterations", 1)):
+    for flag, least in (
+        ("episodes", 1),
+        ("session_episodes", 1),
+        ("seed", 0),
+        ("expert_seed", 0),
+        ("expert_searches", 1),
+        ("expert_iterations", 1),
+    ):
         value = getattr(args, flag)
         if value is not None and value < least:
             raise ValueError(f"--{flag.replace('_', '-')} must be at least {least}")
@@ -135,19 +152,13 @@ def _plan(args: argparse.Namespace) -> Job:
     environments = import_environments()
     from ada_diffuser.collect import Job
 
-    options = {name: _value(text) for name, text in parse_settings(args.option).items()}
+    options = environment_options(args.option)
     env = environments.make(args.env, episode_steps=args.episode_steps, **options)
     noise = _noise(args.action_noise) if args.action_noise else environments.action_noise(env)
     env_id = args.env if ":" in args.env else env.spec.id
-    return Job(env_id, options, args.episodes, noise, args.seed, args.episode_steps, args.blind, args.play)
-
-
-def _value(text: str) -> Any:
-    """JSON where it is JSON, else the word itself."""
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        return text
+    return Job(
+        env_id, options, args.episodes, noise, args.seed, args.episode_steps, args.blind, args.play, session_episodes=args.session_episodes
+    )
 
 
 def _noise(text: str) -> tuple[float, ...]:

@@ -16,6 +16,7 @@ from ada_diffuser.commands import (
     add_trial_arguments,
     check_environment,
     choose,
+    environment_options,
     parse_settings,
     run_command,
     server_url,
@@ -39,9 +40,19 @@ The standard error is that over episodes, and says nothing of another training. 
 
   ada-evaluate --env cheetah-wind-s --models a,b --episodes 50 --seed 1000 --set kappa=0,0.1,inf --set streaming=true,false
 
+--session-episodes N runs the episodes in sessions of N that follow one another, over which what is hidden may last: session k has seed
+SEED + k, between its episodes the environment is reset without a seed, and the model goes on looking back on the episodes before, which
+it must have been trained to do. A second table has the returns by the episode's place in the session. All standard errors are over
+sessions then. Where N does not divide --episodes, the last session is shorter. --forget has the model begin each episode anew, in the same
+contexts: for comparison, and for a model that was trained on episodes one by one.
+
+  ada-evaluate --env cheetah-wind-e --models a --episodes 48 --session-episodes 8
+  ada-evaluate --env cheetah-wind-e --models a --episodes 48 --session-episodes 8 --forget
+
 --readout adds what the latents say of the true context on these episodes, the agent's own: the squared error of a linear map
 from the latent at each act (fitted on the first half of the episodes, judged on the others) over the context's variance, by the
-step of the act in its episode. 0 knows all, 1 nothing but the mean; the errors are over episodes. And k-means with five groups of
+step of the act in its episode. 0 knows all, 1 nothing but the mean; the errors are over episodes. Of sessions, half of which are
+fitted, the first episodes and the later ones are judged each by themselves. And k-means with five groups of
 latents, held against five bins of the context with as many acts in each: adjusted Rand index, purity. With kappa above 0 the latent
 is the refined one, which the window itself had a part in; --set kappa=0 shows the filter's.
 
@@ -66,15 +77,23 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("ada-evaluate", description=_ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_environment_arguments(parser)
+    parser.add_argument(
+        "--env-option", action="append", default=[], metavar="NAME=VALUE", help="option of the environment, value as JSON; repeatable"
+    )
     add_server_arguments(parser)
     add_trial_arguments(parser)
     parser.add_argument("--models", default="", help="names, with commas between (default: the server's default model)")
     parser.add_argument("--episodes", type=int, default=50, help="episodes of each combination (default 50)")
     parser.add_argument("--seed", type=int, help=f"seed of the first episode (default 1000; {choose.FIRST_SEED} with --choose)")
-    parser.add_argument("--vector", type=int, default=64, metavar="N", help="episodes side by side, at most (default 64)")
+    parser.add_argument("--vector", type=int, default=64, metavar="N", help="episodes, or sessions, side by side, at most (default 64)")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=V1,V2", help="values of a sampling option")
     parser.add_argument("--json", type=Path, metavar="FILE", help="a list with the numbers and returns of each combination and recipe")
     parser.add_argument("--markdown", action="store_true", help="print the table alone, no line as each combination ends")
+    sessions = parser.add_argument_group("sessions")
+    sessions.add_argument(
+        "--session-episodes", type=int, default=1, metavar="N", help="so many of the episodes follow one another (default 1: none does)"
+    )
+    sessions.add_argument("--forget", action="store_true", help="let the model forget the episodes before, for comparison")
     readout = parser.add_argument_group("what the latents know")
     readout.add_argument("--readout", action="store_true", help="also read the true context out of the latents, by age in the episode")
     readout.add_argument("--plot", type=Path, metavar="PNG", help="with --readout: latents on two axes, coloured by the true context")
@@ -100,10 +119,16 @@ def _run(arguments: argparse.Namespace) -> None:
     for flag, needs in (("write", "choose"), ("plot", "readout")):
         if getattr(arguments, flag) and not getattr(arguments, needs):
             raise ValueError(f"--{flag} belongs to --{needs}")
+    if arguments.session_episodes < 1:
+        raise ValueError("--session-episodes must be at least 1")
+    if arguments.forget and arguments.session_episodes == 1:
+        raise ValueError("--forget belongs to --session-episodes: an episode by itself follows none")
     if not arguments.choose:
         return _evaluate(arguments)
     if arguments.readout:
         raise ValueError("--choose and --readout are two commands: choose first, then read")
+    if arguments.session_episodes > 1:
+        raise ValueError("--choose compares settings episode by episode, and takes no --session-episodes")
     choose.run(arguments)
 
 
@@ -114,7 +139,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     models = [model.strip() for model in arguments.models.split(",")]
     if len(models) > 1 and not all(models):
         raise ValueError(f"--models {arguments.models!r} has an empty name")
-    check_environment(arguments)
+    env_options = environment_options(arguments.env_option)
+    check_environment(arguments, **env_options)
     from ada_diffuser.rollout import Trial
 
     trials = [
@@ -127,6 +153,9 @@ def _evaluate(arguments: argparse.Namespace) -> None:
             options,
             arguments.episode_steps,
             withhold_rewards=arguments.withhold_rewards,
+            session_episodes=arguments.session_episodes,
+            forget=arguments.forget,
+            env_options=env_options,
         )
         for model in models
         for options in settings
@@ -140,11 +169,13 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
 
 def _tell(arguments: argparse.Namespace, results: Sequence[Evaluation], readings: Sequence[Reading]) -> None:
-    from ada_diffuser.rollout.report import markdown, readout_table
+    from ada_diffuser.rollout.report import markdown, readout_table, session_table
 
     settings = list(parse_settings(arguments.set))
     if results:
         print(markdown(results, settings), flush=True)
+    if results and arguments.session_episodes > 1:
+        print(f"\n{session_table(results, settings)}", flush=True)
     if readings:
         print(f"\n{readout_table(readings, settings)}", flush=True)
     if readings and arguments.plot:

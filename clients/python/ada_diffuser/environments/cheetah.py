@@ -183,13 +183,14 @@ class CheetahVelE(CheetahTask, name="cheetah-vel-e", id="ada/CheetahVel-E-v0"):
     """A wanted speed that is constant within an episode and shows only in the reward.
 
     Args:
-        targets: the speeds to draw from, or `uniform` for U(0, 3), or `lilac` for 1.5 + 1.5 sin(.5 i) in episode `i`.
+        targets: the speeds to draw from, or `uniform` for U(0, 3), or `lilac` for 1.5 + 1.5 sin(.5 i + phi) in episode `i`.
         render_mode: `rgb_array` or None.
+        phase: `phi` of `lilac`, or None to draw it in each session; 0, the paper's, gives all sessions the same speeds.
     """
 
     search = Search(holds="targets")
 
-    def __init__(self, targets: str | Sequence[float] = (1.0, 2.5), render_mode: str | None = None) -> None:
+    def __init__(self, targets: str | Sequence[float] = (1.0, 2.5), render_mode: str | None = None, phase: float | None = 0.0) -> None:
         super().__init__(render_mode=render_mode)
         if isinstance(targets, str):
             if targets not in ("uniform", "lilac"):
@@ -197,7 +198,8 @@ class CheetahVelE(CheetahTask, name="cheetah-vel-e", id="ada/CheetahVel-E-v0"):
         elif not targets:
             raise ValueError("targets must name at least one speed")
         self.targets = targets if isinstance(targets, str) else tuple(float(v) for v in targets)
-        self._speed = 0.0
+        self.phase = phase
+        self._phi = self._speed = 0.0
 
     @property
     def search_targets(self) -> tuple[float, ...]:
@@ -208,7 +210,9 @@ class CheetahVelE(CheetahTask, name="cheetah-vel-e", id="ada/CheetahVel-E-v0"):
         if self.targets == "uniform":
             self._speed = self.np_random.uniform(0.0, 3.0)
         elif self.targets == "lilac":
-            self._speed = 1.5 + 1.5 * math.sin(0.5 * self._episode)
+            if starts_session:
+                self._phi = self.np_random.uniform(0.0, 2.0 * math.pi) if self.phase is None else self.phase
+            self._speed = 1.5 + 1.5 * math.sin(0.5 * self._episode + self._phi)
         else:
             self._speed = self.targets[self.np_random.integers(len(self.targets))]
 

@@ -22,7 +22,7 @@ Progress = Callable[[int], object]
 
 
 def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: None) -> Evaluation:
-    """Runs the trial's episodes, in groups of `trial.vector`, in as many sessions.
+    """Runs the trial's sessions, `trial.vector` of them side by side.
 
     Rewards are reported with the actions, since a latent may live off them, unless the trial withholds them. Raises the
     `AdaError` of the first act that cannot be had, and ValueError where environment and model do not fit.
@@ -32,31 +32,44 @@ def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: No
     with ExitStack() as stack:
         lanes = _open_lanes(client, trial, stack)
         session = lanes[0].broker.session
-        for first in range(trial.seed, trial.seed + trial.episodes, len(lanes)):
-            seeds = range(first, min(first + len(lanes), trial.seed + trial.episodes))
-            group = lanes[: len(seeds)]
-            for lane, seed in zip(group, seeds, strict=True):
-                lane.start(seed)
+        for first in range(0, len(trial.sessions), len(lanes)):
+            sessions = trial.sessions[first : first + len(lanes)]
+            group = lanes[: len(sessions)]
+            for lane, (seed, length) in zip(group, sessions, strict=True):
+                lane.start(seed, length)
             _run(client, trial, group, acts, progress)
-            episodes += [lane.episode for lane in group]
+            episodes += [episode for lane in group for episode in lane.episodes]
     return Evaluation(trial, session.model, session.options, episodes, acts, time.monotonic() - started)
 
 
 class _Lane:
-    """One environment and its session."""
+    """One environment and its session on the server."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], broker: ChunkBroker, *, withhold_rewards: bool) -> None:
-        self.env, self.broker, self._withhold_rewards = env, broker, withhold_rewards
+    def __init__(self, env: gymnasium.Env[Any, Any], broker: ChunkBroker, trial: Trial) -> None:
+        self.env, self.broker, self._trial = env, broker, trial
+        #: Whether the last of `_length` episodes is over.
         self.done = True
-        self.episode = Episode(seed=0)
+        self.episodes: list[Episode] = []
+        self._length = 0
         self.state = np.zeros(0, np.float32)
 
-    def start(self, seed: int) -> None:
-        """A new episode, of the environment and of the session."""
-        observation, _ = self.env.reset(seed=seed)
-        self.broker.reset(seed)
+    @property
+    def episode(self) -> Episode:
+        """The one under way."""
+        return self.episodes[-1]
+
+    def start(self, seed: int, length: int) -> None:
+        """The first of so many episodes that follow one another."""
+        self.episodes, self._length, self.done = [], length, False
+        self._begin(seed)
+
+    def _begin(self, seed: int) -> None:
+        """The next episode of the session with this seed: the environment goes on drawing where it was, and the model looks back."""
+        index = len(self.episodes)
+        observation, _ = self.env.reset(seed=None if index else seed)
+        self.broker.reset(_model_seed(seed, index), keep_history=index > 0 and not self._trial.forget)
         self.state = np.asarray(observation, np.float32)
-        self.episode, self.done = Episode(seed), False
+        self.episodes.append(Episode(seed, index=index))
 
     def accept(self, chunk: Chunk) -> None:
         """The answer of the act that was due."""
@@ -68,26 +81,33 @@ class _Lane:
         """Executes the next action of the chunk and reports what came of it."""
         action = self.broker.take(self.state)
         observation, reward, terminated, truncated, facts = self.env.step(action)
-        self.broker.report(reward=None if self._withhold_rewards else float(reward))
+        self.broker.report(reward=None if self._trial.withhold_rewards else float(reward))
         self.episode.states.append(self.state)
         self.episode.actions.append(action)
         self.episode.rewards.append(float(reward))
         if "context" in facts:
             self.episode.contexts.append(np.atleast_1d(np.asarray(facts["context"], np.float32)).copy())
         self.state = np.asarray(observation, np.float32)
-        self.done = bool(terminated or truncated)
-        if self.done:
+        if terminated or truncated:
             self.episode.failed = environments.failed(self.env, self.episode.total)
+            self.done = len(self.episodes) == self._length
+            if not self.done:
+                self._begin(self.episode.seed)
+
+
+def _model_seed(seed: int, index: int) -> int:
+    """Of an episode in the session with this seed: its own noise in each, and the same in each run."""
+    return int(np.random.SeedSequence([seed, index]).generate_state(1)[0]) if index else seed
 
 
 def _open_lanes(client: Client, trial: Trial, stack: ExitStack) -> list[_Lane]:
     lanes = []
-    for slot in range(min(trial.vector, trial.episodes)):
-        env = environments.make(trial.env, episode_steps=trial.episode_steps)
+    for seed, _ in trial.sessions[: trial.vector]:
+        env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
         stack.callback(env.close)
-        session = stack.enter_context(client.open_session(trial.model, seed=trial.seed + slot, options=trial.options))
+        session = stack.enter_context(client.open_session(trial.model, seed=seed, options=trial.options))
         _check_fit(trial.env, env, session.model)
-        lanes.append(_Lane(env, ChunkBroker(session), withhold_rewards=trial.withhold_rewards))
+        lanes.append(_Lane(env, ChunkBroker(session), trial))
     return lanes
 
 
@@ -96,9 +116,11 @@ def check(client: Client, trial: Trial) -> int:
 
     Returns the steps of an episode at most.
     """
-    env = environments.make(trial.env, episode_steps=trial.episode_steps)
+    env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
     with closing(env), client.open_session(trial.model, seed=trial.seed, options=trial.options) as session:
         _check_fit(trial.env, env, session.model)
+        if trial.session_episodes > 1 and not trial.forget:
+            session.reset(trial.seed, keep_history=True)  # refused where the model was trained on episodes one by one
         return environments.steps_max(env)
 
 

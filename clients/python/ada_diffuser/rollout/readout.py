@@ -8,19 +8,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ada_diffuser.rollout.clusters import Clusters, cluster
-from ada_diffuser.rollout.result import Episode, Evaluation
+from ada_diffuser.rollout.result import Episode, Evaluation, by_session, mean_and_error
 from ada_diffuser.rollout.seeds import training_seed
 
 #: Weights of the penalty to choose from, for standardised latents, per sample.
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Steps of the episode at which an act is judged, from the first up to the second or the end: all, in bands, and when it has seen much.
 AGES: tuple[tuple[int, int | None], ...] = ((0, None), (0, 10), (10, 30), (30, 80), (80, None), (50, None))
+#: Which episodes of their sessions are judged: in later ones the latent may look back on those before.
+Place = Literal["all", "first", "later"]
 #: A context that varies less counts as constant.
 VARIANCE_MIN = 1e-12
 
@@ -33,7 +35,7 @@ class AgeError:
     age: tuple[int, int]
     #: Squared error over the context's variance on all shown acts, the mean of its dimensions: 0 knows all, 1 nothing but the mean.
     mse: float
-    #: Of `mse`, over episodes.
+    #: Of `mse`, over sessions.
     standard_error: float
     #: Shown episodes that have an act of that age.
     episodes: int
@@ -41,7 +43,7 @@ class AgeError:
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """A ridge regression, fitted on the first half of the episodes and shown on the others."""
+    """A ridge regression, fitted on the first half of the sessions and shown on the others."""
 
     #: `(latent_dim + 1, context_dim)`, the last row is the offset.
     weights: NDArray[np.float64]
@@ -59,46 +61,50 @@ class Readout:
         latents, _ = _pairs([episode])
         return _with_one(latents) @ self.weights
 
-    def by_age(self, ages: Sequence[tuple[int, int | None]] = AGES) -> list[AgeError]:
-        """The error at each range of ages that some act of the shown episodes has."""
+    def by_age(self, ages: Sequence[tuple[int, int | None]] = AGES, place: Place = "all") -> list[AgeError]:
+        """The error at each range of ages, within its episode, that some act of the shown episodes in that place of their sessions has."""
         end = max(len(episode.rewards) for episode in self.shown)
         ranges = [(first, end if last is None else min(last, end)) for first, last in ages if first < end]
-        return [error for age in ranges if (error := self._at(age))]
+        return [error for age in ranges if (error := self._at(age, place))]
 
-    def _at(self, age: tuple[int, int]) -> AgeError | None:
-        kept = [errors[(age[0] <= steps) & (steps < age[1])] for steps, errors in self._errors]
-        counts = np.array([len(errors) for errors in kept if len(errors)])
-        sums = np.array([errors.sum() for errors in kept if len(errors)])
-        if not len(counts):
+    def _at(self, age: tuple[int, int], place: Place) -> AgeError | None:
+        sessions = [[_aged(one, errors, age) for one, errors in session if _stands(one, place)] for session in self._errors]
+        kept = [[errors for errors in session if len(errors)] for session in sessions]
+        kept = [session for session in kept if session]
+        if not kept:
             return None
-        mse, n = float(sums.sum() / counts.sum()), len(counts)
-        # Of a ratio: episodes may have different numbers of acts.
-        spread = np.sqrt(n / (n - 1) * np.sum((sums - mse * counts) ** 2)) / counts.sum() if n > 1 else 0.0
-        return AgeError(age, mse, float(spread), n)
+        return AgeError(age, *mean_and_error([np.concatenate(session) for session in kept]), sum(map(len, kept)))
 
     @cached_property
-    def _errors(self) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Of each shown episode: the steps of its acts, and the standardised squared error of each."""
+    def _errors(self) -> list[list[tuple[Episode, NDArray[np.float64]]]]:
+        """Of each shown session: its episodes, and the standardised squared error at each of their acts."""
         variance = _pairs(self.shown)[1].var(axis=0)
         varies = variance > VARIANCE_MIN
-        errors = [((_pairs([one])[1] - self.of(one)) ** 2)[:, varies] / variance[varies] for one in self.shown]
-        return [(np.array(one.act_steps), error.mean(axis=1)) for one, error in zip(self.shown, errors, strict=True)]
+
+        def errors(one: Episode) -> NDArray[np.float64]:
+            squared: NDArray[np.float64] = ((_pairs([one])[1] - self.of(one)) ** 2)[:, varies] / variance[varies]
+            return squared.mean(axis=1)
+
+        return [[(one, errors(one)) for one in session] for session in by_session(self.shown)]
 
 
 def fit(episodes: Sequence[Episode]) -> Readout | str:
-    """Fits on the first half, to be judged on the rest; a sentence that says why not, where it cannot."""
-    first_shown = (len(episodes) + 1) // 2
-    if len(episodes) < 2:
-        return "a readout needs at least two episodes: one to fit, one to show"
+    """Fits on the first half of the sessions, to be judged on the rest; a sentence that says why not, where it cannot."""
+    sessions = by_session(episodes)
+    fitted = sessions[: (len(sessions) + 1) // 2]
+    if len(sessions) < 2:
+        what = "sessions" if len(episodes) > 1 else "episodes"
+        return f"a readout needs at least two {what}: one to fit, one to show"
     if not episodes[0].latents or episodes[0].latents[0].size == 0:
         return "this model has no latent to read out"
     if not episodes[0].contexts:
         return "this environment does not tell its context"
-    fitted, shown = list(episodes[:first_shown]), list(episodes[first_shown:])
+    first_shown = sum(map(len, fitted))
+    shown = list(episodes[first_shown:])
     if not np.any(_pairs(shown)[1].var(axis=0) > VARIANCE_MIN):
         return "the context was the same in all shown episodes: there is nothing to tell apart (try more episodes)"
     penalty = min(PENALTIES, key=lambda penalty: _left_out_error(fitted, penalty))
-    return Readout(_ridge(*_pairs(fitted), penalty), first_shown, shown)
+    return Readout(_ridge(*_pairs(episodes[:first_shown]), penalty), first_shown, shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +122,17 @@ class Reading:
         """What the latent was inferred from: what really happened (`filter`), or also the window itself (`refined`: kappa above 0)."""
         return "refined" if self.result.options.kappa else "filter"
 
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Of which episodes there are errors: where sessions are longer than one, the first and the later ones by themselves."""
+        return ("first", "later") if self.result.trial.session_episodes > 1 else ("all",)
+
+    def errors(self, place: Place) -> list[AgeError]:
+        """By age; none where nothing can be read."""
+        return [] if isinstance(self.readout, str) else self.readout.by_age(place=place)
+
     def rows(self) -> list[dict[str, Any]]:
-        """For JSON, one a range of ages; none where nothing can be read."""
-        if isinstance(self.readout, str):
-            return []
+        """For JSON, one a range of ages and place in the session; none where nothing can be read."""
         result = self.result
         return [
             {
@@ -128,13 +141,15 @@ class Reading:
                 "seed": training_seed(result.model.name),
                 "where": "own_rollouts",
                 "evidence": self.evidence,
+                **({} if place == "all" else {"episode": place}),
                 "age": list(error.age),
                 "mse": round(error.mse, 6),
                 "r2": round(1 - error.mse, 6),
                 "episodes": error.episodes,
                 "standard_error": round(error.standard_error, 6),
             }
-            for error in self.readout.by_age()
+            for place in self.places
+            for error in self.errors(place)
         ]
 
     def as_json(self) -> dict[str, Any]:
@@ -152,12 +167,22 @@ def read(result: Evaluation) -> Reading:
     return Reading(result, readout, None if isinstance(readout, str) else cluster(*_pairs(result.episodes)))
 
 
-def _left_out_error(episodes: Sequence[Episode], penalty: float) -> float:
-    """Squared error on each episode in turn, fitted on the others (0 if there are none): a weak latent needs a strong penalty."""
+def _aged(episode: Episode, errors: NDArray[np.float64], age: tuple[int, int]) -> NDArray[np.float64]:
+    """The errors at the acts of that age."""
+    steps = np.array(episode.act_steps)
+    return errors[(age[0] <= steps) & (steps < age[1])]
+
+
+def _stands(episode: Episode, place: Place) -> bool:
+    return place == "all" or (episode.index > 0) == (place == "later")
+
+
+def _left_out_error(sessions: Sequence[list[Episode]], penalty: float) -> float:
+    """Squared error on each session in turn, fitted on the others (0 if there are none): a weak latent needs a strong penalty."""
     error = 0.0
-    for index in range(len(episodes) if len(episodes) > 1 else 0):
-        others = [*episodes[:index], *episodes[index + 1 :]]
-        latents, contexts = _pairs(episodes[index : index + 1])
+    for index in range(len(sessions) if len(sessions) > 1 else 0):
+        others = [episode for session in [*sessions[:index], *sessions[index + 1 :]] for episode in session]
+        latents, contexts = _pairs(sessions[index])
         error += float(np.sum((contexts - _with_one(latents) @ _ridge(*_pairs(others), penalty)) ** 2))
     return error
 

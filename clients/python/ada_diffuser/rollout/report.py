@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from statistics import fmean
 
 from ada_diffuser.rollout.choice import Choice, Tried
-from ada_diffuser.rollout.readout import AgeError, Reading, Readout
+from ada_diffuser.rollout.readout import Place, Reading, Readout
 from ada_diffuser.rollout.result import Evaluation
 from ada_diffuser.rollout.seeds import SeedGroup, by_recipe
 
@@ -36,7 +36,8 @@ def table(result: Evaluation, readout: Readout | str) -> str:
 
 def outcome(result: Evaluation) -> str:
     """In a line of a log."""
-    return f"{result.mean_return:.2f} ± {result.standard_error:.2f}, {result.failures} failed, {result.wall_s:.1f} s"
+    places = f", by episode {' '.join(f'{one.mean_return:.2f}' for one in result.by_index)}" if result.trial.session_episodes > 1 else ""
+    return f"{result.mean_return:.2f} ± {result.standard_error:.2f}{places}, {result.failures} failed, {result.wall_s:.1f} s"
 
 
 def _server_row(result: Evaluation, part: str) -> str:
@@ -54,9 +55,7 @@ def markdown(results: Sequence[Evaluation], settings: Sequence[str]) -> str:
     heads = ["environment", "model", *settings, "return", error, "median", "failures", "evaluations/act", "p50 ms", "p99 ms"]
     rows = [_trial_cells(result, settings) for result in results] + [_group_cells(group, settings) for group in groups]
     if not groups:
-        at = heads.index(error)
-        for row in [heads, *rows]:
-            del row[at]
+        _drop(error, heads, rows)
     return _rows(heads, rows)
 
 
@@ -91,6 +90,25 @@ def _group_cells(group: SeedGroup, settings: Sequence[str]) -> list[str]:
     ]
 
 
+def session_table(results: Sequence[Evaluation], settings: Sequence[str]) -> str:
+    """One row a trial in sessions: what the episodes earn by their place in the session; the errors are over sessions."""
+    indices = range(max(len(result.by_index) for result in results))
+    heads = ["environment", "model", *settings, "history", "sessions", *(f"episode {index}" for index in indices)]
+    return _rows(heads, [_session_cells(result, settings, indices) for result in results])
+
+
+def _session_cells(result: Evaluation, settings: Sequence[str], indices: Sequence[int]) -> list[str]:
+    by_index = {one.index: f"{one.mean_return:.2f} ± {one.standard_error:.2f}" for one in result.by_index}
+    return [
+        result.trial.env,
+        result.model.name,
+        *(_setting(getattr(result.options, name)) for name in settings),
+        "forgotten" if result.trial.forget else "kept",
+        str(len(result.trial.sessions)),
+        *(by_index.get(index, "") for index in indices),
+    ]
+
+
 def choice_table(choice: Choice) -> str:
     """One row a setting, in Markdown: what it earned, and how far that is below the best cold one's, episode by episode."""
     names = list(dict.fromkeys(name for one in choice.tried for name in one.setting.values()))
@@ -113,30 +131,38 @@ def _tried_cells(one: Tried, choice: Choice, names: Sequence[str]) -> list[str]:
 
 
 def readout_table(readings: Sequence[Reading], settings: Sequence[str]) -> str:
-    """What each latent says of the true context: the standardised squared error of a linear map from it, by age in the episode."""
-    errors = [[] if isinstance(one.readout, str) else one.readout.by_age() for one in readings]
-    ages = list(dict.fromkeys(error.age for of_one in errors for error in of_one))
-    heads = [
-        "environment",
-        "model",
-        *settings,
-        "latent",
-        *(f"steps {first} to {last - 1}" for first, last in ages),
-        "k-means: Rand index, purity",
-    ]
-    return _rows(heads, [_reading_cells(one, of_one, settings, ages) for one, of_one in zip(readings, errors, strict=True)])
+    """What each latent says of the true context: the standardised squared error of a linear map from it, by age in the episode.
+
+    Where episodes follow one another, the first ones and the later ones have a row each.
+    """
+    placed = [(one, place) for one in readings for place in one.places]
+    ages = list(dict.fromkeys(error.age for one, place in placed for error in one.errors(place)))
+    steps = [f"steps {first} to {last - 1}" for first, last in ages]
+    heads = ["environment", "model", *settings, "latent", "episodes", *steps, "k-means: Rand index, purity"]
+    rows = [_reading_cells(one, place, settings, ages) for one, place in placed]
+    if all(place == "all" for _, place in placed):
+        _drop("episodes", heads, rows)
+    return _rows(heads, rows)
 
 
-def _reading_cells(one: Reading, errors: Sequence[AgeError], settings: Sequence[str], ages: Sequence[tuple[int, int]]) -> list[str]:
-    by_age = {error.age: f"{error.mse:.3f} ± {error.standard_error:.3f}" for error in errors}
+def _reading_cells(one: Reading, place: Place, settings: Sequence[str], ages: Sequence[tuple[int, int]]) -> list[str]:
+    by_age = {error.age: f"{error.mse:.3f} ± {error.standard_error:.3f}" for error in one.errors(place)}
     return [
         one.result.trial.env,
         one.result.model.name,
         *(_setting(getattr(one.result.options, name)) for name in settings),
         one.readout if isinstance(one.readout, str) else one.evidence,
+        place,
         *(by_age.get(age, "") for age in ages),
         f"{one.clusters.adjusted_rand_index:.2f}, {one.clusters.purity:.2f}" if one.clusters else "",
     ]
+
+
+def _drop(head: str, heads: list[str], rows: Sequence[list[str]]) -> None:
+    """Leaves out a column that would say nothing."""
+    at = heads.index(head)
+    for row in [heads, *rows]:
+        del row[at]
 
 
 def _rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

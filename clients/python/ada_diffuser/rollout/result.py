@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -20,9 +21,9 @@ class Trial:
     #: `name` or `name@digest`; empty: the server's default model.
     model: str = ""
     episodes: int = 10
-    #: Episode `e` runs with seed `seed + e`, of the environment and of the model: all models see the same episodes.
+    #: Session `k` runs with seed `seed + k`, of the environment and of the model: all models see the same episodes.
     seed: int = 0
-    #: Episodes that step side by side with one ActBatch a step; 1: one after the other, by Act.
+    #: Sessions that step side by side with one ActBatch a step; 1: one after the other, by Act.
     vector: int = 1
     #: Overrides of the model's sampling defaults.
     options: SamplerOptions = field(default_factory=SamplerOptions)
@@ -30,16 +31,34 @@ class Trial:
     episode_steps: int | None = None
     #: Whether the agent is told no reward, as where nobody measures it.
     withhold_rewards: bool = False
+    #: Episodes of a session, over which what is hidden may last: the environment is given no seed between them, and the model keeps its
+    #: history. The last session has what is left.
+    session_episodes: int = 1
+    #: Whether the model forgets its history between them all the same.
+    forget: bool = False
+    #: Keyword arguments of the environment.
+    env_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        if self.episodes < 1 or self.vector < 1 or self.seed < 0:
-            raise ValueError("episodes and vector must be at least 1, and the seed at least 0")
+        if self.episodes < 1 or self.vector < 1 or self.session_episodes < 1 or self.seed < 0:
+            raise ValueError("episodes, vector and session_episodes must be at least 1, and the seed at least 0")
+
+    def env_options_as_json(self) -> dict[str, Any]:
+        """Nothing where there are none."""
+        return {"env_options": dict(self.env_options)} if self.env_options else {}
+
+    @property
+    def sessions(self) -> list[tuple[int, int]]:
+        """Seed and number of episodes of each."""
+        firsts = range(0, self.episodes, self.session_episodes)
+        return [(self.seed + k, min(self.session_episodes, self.episodes - first)) for k, first in enumerate(firsts)]
 
 
 @dataclass(eq=False)
 class Episode:
     """One episode; lists grow step by step, with the states that the agent saw and the actions it took."""
 
+    #: Of its session.
     seed: int
     states: list[NDArray[np.float32]] = field(default_factory=list)
     actions: list[NDArray[np.float32]] = field(default_factory=list)
@@ -50,6 +69,8 @@ class Episode:
     act_steps: list[int] = field(default_factory=list)
     latents: list[NDArray[np.float32]] = field(default_factory=list)
     failed: bool = False
+    #: Its place in the session, from 0.
+    index: int = 0
 
     @property
     def total(self) -> float:
@@ -87,6 +108,39 @@ class ActLog:
         )
 
 
+@dataclass(frozen=True)
+class IndexReturn:
+    """What the episodes with one place in their sessions earned."""
+
+    index: int
+    #: How many, each of another session.
+    sessions: int
+    mean_return: float
+    #: Of the mean, over sessions.
+    standard_error: float
+    failures: int
+
+
+def mean_and_error(groups: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
+    """The mean of all numbers, and its standard error over the groups (sessions), which need not have equally many.
+
+    0 for a single group, which says nothing of the spread.
+    """
+    counts, sums = np.array([len(group) for group in groups]), np.array([group.sum() for group in groups])
+    mean, n = float(sums.sum() / counts.sum()), len(groups)
+    return mean, float(np.sqrt(n / (n - 1) * np.sum((sums - mean * counts) ** 2)) / counts.sum()) if n > 1 else 0.0
+
+
+def by_session(episodes: Sequence[Episode]) -> list[list[Episode]]:
+    """Those that follow one another together, in order."""
+    sessions: list[list[Episode]] = []
+    for episode in episodes:
+        if episode.index == 0 or not sessions:
+            sessions.append([])
+        sessions[-1].append(episode)
+    return sessions
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """A finished trial."""
@@ -102,7 +156,7 @@ class Evaluation:
 
     def joined(self, more: Evaluation) -> Evaluation:
         """These episodes and those of `more`, which go on where these end: what one trial of all of them would have brought."""
-        if more.trial.seed != self.trial.seed + len(self.episodes) or more.options != self.options:
+        if more.trial.seed != self.trial.seed + len(self.trial.sessions) or more.options != self.options:
             raise ValueError("only episodes with the next seeds and the same options can be joined")
         episodes = self.episodes + more.episodes
         trial = replace(self.trial, episodes=len(episodes))
@@ -119,8 +173,8 @@ class Evaluation:
 
     @property
     def standard_error(self) -> float:
-        """Of the mean; 0 for a single episode, which says nothing about the spread."""
-        return float(self.returns.std(ddof=1) / np.sqrt(len(self.returns))) if len(self.returns) > 1 else 0.0
+        """Of the mean, over sessions, since the episodes of one are alike; 0 for a single one, which says nothing about the spread."""
+        return mean_and_error([np.array([episode.total for episode in session]) for session in by_session(self.episodes)])[1]
 
     @property
     def median_return(self) -> float:
@@ -130,6 +184,16 @@ class Evaluation:
     def failures(self) -> int:
         """Episodes that the environment calls failed."""
         return sum(episode.failed for episode in self.episodes)
+
+    @property
+    def by_index(self) -> list[IndexReturn]:
+        """Returns by the episode's place in its session."""
+        found = []
+        for index in sorted({episode.index for episode in self.episodes}):
+            placed = [episode for episode in self.episodes if episode.index == index]
+            mean, error = mean_and_error([np.array([episode.total]) for episode in placed])
+            found.append(IndexReturn(index, len(placed), mean, error, sum(episode.failed for episode in placed)))
+        return found
 
     @property
     def evaluations_per_act(self) -> float:
@@ -147,6 +211,7 @@ class Evaluation:
         """Everything that a report needs, per-episode returns included."""
         return {
             "env": self.trial.env,
+            **self.trial.env_options_as_json(),
             "model": self.model.name,
             "model_digest": self.model.digest,
             "seed": self.trial.seed,
@@ -167,6 +232,23 @@ class Evaluation:
                 part: {"p50": self.server_ms(part, 50), "p99": self.server_ms(part, 99)} for part in ("queue", "compute", "commit", "total")
             },
             "wall_s": self.wall_s,
+            **(self._sessions_as_json() if self.trial.session_episodes > 1 else {}),
+        }
+
+    def _sessions_as_json(self) -> dict[str, Any]:
+        return {
+            "session_episodes": self.trial.session_episodes,
+            "keep_history": not self.trial.forget,
+            "by_episode": [
+                {
+                    "episode": one.index,
+                    "sessions": one.sessions,
+                    "mean_return": round(one.mean_return, 6),
+                    "standard_error": round(one.standard_error, 6),
+                    "failures": one.failures,
+                }
+                for one in self.by_index
+            ],
         }
 
 

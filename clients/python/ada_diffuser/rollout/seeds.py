@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ada_diffuser.rollout.result import Evaluation, plain_options
+from ada_diffuser.rollout.result import Evaluation, by_session, mean_and_error, plain_options
 
 _SEED = re.compile(r"-seed(\d+)$")
 
@@ -30,9 +30,9 @@ class SeedGroup:
 
     @property
     def standard_error(self) -> float:
-        """Of the mean over episodes, these trainings given: each episode's return is first averaged over the training seeds."""
-        episodes = self._returns().mean(axis=0)
-        return float(episodes.std(ddof=1) / np.sqrt(len(episodes))) if len(episodes) > 1 else 0.0
+        """Of the mean over sessions, these trainings given: each episode's return is first averaged over the training seeds."""
+        ends = np.cumsum([len(session) for session in by_session(self.results[0].episodes)])
+        return mean_and_error(np.split(self._returns().mean(axis=0), ends[:-1]))[1]
 
     @property
     def standard_error_training(self) -> float:
@@ -53,6 +53,7 @@ class SeedGroup:
         first = self.results[0].trial
         return {
             "env": first.env,
+            **first.env_options_as_json(),
             "model": self.recipe,
             "training_seeds": [result.model.name for result in self.results],
             "seed": first.seed,
@@ -84,6 +85,6 @@ def by_recipe(results: Sequence[Evaluation]) -> list[SeedGroup]:
         name, seeds = _SEED.subn("", result.model.name)
         if seeds:
             trial = result.trial
-            key = (name, trial.env, trial.seed, trial.episodes, trial.episode_steps, trial.withhold_rewards, trial.options)
+            key = (name, replace(trial, model="", vector=1))
             groups.setdefault(key, {})[result.model.name] = result
     return [SeedGroup(key[0], list(group.values())) for key, group in groups.items() if len(group) > 1]
