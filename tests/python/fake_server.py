@@ -108,7 +108,7 @@ MODEL = {
     **{"name": "fake", "digest": "0" * 64, "is_default": True, "state_dim": 2, "action_dim": 2, "plan_horizon": 4},
     **{"block_len": 2, "obs_horizon": 1, "latent_dim": 1, "level_max": 5, "refined": True},
     **{"action_low": [-1.0, -1.0], "action_high": [1.0, 1.0], "sampler": {"kappa": 1.0, "latent": "mean"}},
-    "trained": {"action_horizons": [3], "sub_steps": [1], "missing": {"state": False, "action": False, "reward": True}},
+    "trained": {"action_horizons": [3], "sub_steps": [1], "missing": {"state": False, "action": False, "reward": True}, "sessions": True},
 }
 
 

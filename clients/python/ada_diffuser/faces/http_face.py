@@ -350,9 +350,7 @@ def _model(model: Mapping[str, Any]) -> Model:
         action_low=_floats(model["action_low"]),
         action_high=_floats(model["action_high"]),
         sampler=_options_in(model["sampler"]),
-        trained=Trained(
-            tuple(trained["action_horizons"]), tuple(trained["sub_steps"]), Missing(**trained["missing"]), trained["sessions"]
-        ),
+        trained=Trained(tuple(trained["action_horizons"]), tuple(trained["sub_steps"]), Missing(**trained["missing"]), trained["sessions"]),
     )
 
 
