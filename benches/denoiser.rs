@@ -26,7 +26,7 @@ fn config(backbone: Backbone) -> ModelConfig {
     let latent = GruLatent::plain(20, 64, Looks::Block(10));
     let mut config = ModelConfig::plain(Layout { state_dim: STATE, action_dim: ACTION }, Some(latent), backbone);
     (config.method.plan.horizon, config.method.plan.level_max) = (T, 150);
-    config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
+    config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY, ..Restart::default() };
     config
 }
 

@@ -89,7 +89,7 @@ impl Flags {
         config.defaults = Defaults {
             sampler: SamplerOptions { temperature: 0.0, ..SamplerOptions::default() },
             // Finite, since JSON has no infinity, and out of reach.
-            restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: 1e30 },
+            restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: 1e30, ..Restart::default() },
         };
         config
     }

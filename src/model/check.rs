@@ -35,8 +35,13 @@ impl ModelConfig {
     pub fn check(&self) -> Result<(), Unfit> {
         self.check_sizes()?;
         self.units.check(self.layout)?;
-        let Restart { renoise_distance, cold_distance, latent_jump } = self.defaults.restart;
-        for (field, value) in [("renoise_distance", renoise_distance), ("cold_distance", cold_distance), ("latent_jump", latent_jump)] {
+        let Restart { renoise_distance, cold_distance, latent_jump, latent_kl } = self.defaults.restart;
+        for (field, value) in [
+            ("renoise_distance", renoise_distance),
+            ("cold_distance", cold_distance),
+            ("latent_jump", latent_jump),
+            ("latent_kl", latent_kl),
+        ] {
             require(value >= 0.0, format!("defaults.restart.{field}"), format!("is {value}, must be 0 or above (inf: never)"))?;
         }
         let sampler = |(field, reason)| Unfit { field: format!("defaults.sampler.{field}"), reason };

@@ -114,6 +114,8 @@ fn bad_defaults_leave_the_checkpoint_as_it_was() {
     };
     for (text, words) in [
         ("restart.latent_jump=-1", "restart.latent_jump: is -1"),
+        ("restart.latent_kl=-1", "restart.latent_kl: is -1"),
+        ("restart.latent_lk=1", "restart.latent_lk: unknown field"),
         ("restart.cold_distance=\"NaN\"", "restart.cold_distance"),
         ("sampler.kappa=-0.1", "sampler.kappa"),
         ("sampler.sub_steps=2305843009213693953", "sampler.sub_steps"),
@@ -126,5 +128,11 @@ fn bad_defaults_leave_the_checkpoint_as_it_was() {
         assert!(files.iter().all(|name| same(name)), "{text}");
     }
     set("restart.latent_jump=inf").unwrap();
-    assert!(checkpoint::load(dir.path()).unwrap().config().defaults.restart.latent_jump.is_infinite());
+    let restart = || checkpoint::load(dir.path()).unwrap().config().defaults.restart;
+    assert!(restart().latent_jump.is_infinite());
+    set("restart.latent_kl=1.5").unwrap();
+    assert_eq!(restart().latent_kl, 1.5);
+    set("restart.latent_kl=inf").unwrap();
+    assert!(restart().latent_kl.is_infinite());
+    assert!(!fs::read_to_string(dir.path().join("config.json")).unwrap().contains("latent_kl"), "off is not named, as it never was");
 }

@@ -31,8 +31,8 @@ fn set(config: &mut Value, text: &str) -> Result<()> {
     if !["sampler", "restart"].contains(&section) {
         bail!("--set {text}: only keys of sampler and restart can be changed after training");
     }
-    let entry = config["defaults"][section].get_mut(name).with_context(|| format!("--set {text}: {section} has no {name}"))?;
-    *entry = match value {
+    // Not every key is written where it stands at its default: one that there is not is refused by the name of its field.
+    config["defaults"][section][name] = match value {
         "inf" | "infinity" => Value::Null,
         _ => serde_json::from_str(value).unwrap_or_else(|_| Value::String(value.into())),
     };

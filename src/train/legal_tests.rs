@@ -9,12 +9,13 @@ use super::{
 use crate::model::{
     Networks,
     checkpoint::{Provenance, load, save},
+    config::Restart,
     nn::params::Params,
 };
 use proptest::{prelude::*, sample::select};
 use std::{fs, path::Path};
 
-const KEYS: [&str; 47] = [
+const KEYS: [&str; 48] = [
     "seed",
     "checkpoint_every",
     "log_every",
@@ -58,6 +59,7 @@ const KEYS: [&str; 47] = [
     "restart.renoise_distance",
     "restart.cold_distance",
     "restart.latent_jump",
+    "restart.latent_kl",
     "stages.identify.gate.filter",
     "hide.state",
     "hide.action",
@@ -134,16 +136,36 @@ fn check(changes: &[String]) -> Result<(), String> {
 /// A recipe with a negative or infinite `restart`, or an infinite `state_clip`, trained to the end into a checkpoint that was refused.
 #[test]
 fn what_was_legal_and_did_not_load() {
-    for change in ["restart.latent_jump=-1.0", "restart.cold_distance=inf", "restart.renoise_distance=nan", "model.plan.clip=inf"] {
+    for change in [
+        "restart.latent_jump=-1.0",
+        "restart.latent_kl=-1.0",
+        "restart.latent_kl=inf",
+        "restart.latent_kl=1.0",
+        "restart.cold_distance=inf",
+        "restart.renoise_distance=nan",
+        "model.plan.clip=inf",
+    ] {
         check(&[change.to_string()]).unwrap_or_else(|error| panic!("{change}: {error}"));
     }
     let refused = |change: &str| {
         recipe_with(&["restart={renoise_distance=1, cold_distance=1, latent_jump=1}", change]).err().map(|error| error.to_string())
     };
     assert!(refused("restart.latent_jump=-1.0").unwrap().contains("`restart.latent_jump`: is -1"));
+    assert!(refused("restart.latent_kl=-1.0").unwrap().contains("`restart.latent_kl`: is -1"));
     assert!(refused("model.plan.clip=inf").unwrap().contains("`model.plan.clip`: is inf"));
     assert_eq!(refused("restart.latent_jump=inf"), None, "never");
     assert!(Path::new("tests/golden/data_good.h5").exists(), "the data set is there, so these were not refused for want of it");
+}
+
+/// Checkpoints and recipes from before do not name `latent_kl`, which is off then, and none that leaves it off is written otherwise.
+#[test]
+fn what_is_not_named_is_off() {
+    let before = r#"{"renoise_distance":0.5,"cold_distance":1.5,"latent_jump":null}"#;
+    let restart: Restart = serde_json::from_str(before).unwrap();
+    assert_eq!(restart, Restart { latent_jump: f32::INFINITY, latent_kl: f32::INFINITY, ..Restart::default() });
+    assert_eq!(serde_json::to_string(&restart).unwrap(), before);
+    let written = |change: &str| recipe_with(&["restart={renoise_distance=1, cold_distance=1, latent_jump=1}", change]).unwrap().to_toml();
+    assert!(!written("restart.latent_kl=inf").contains("latent_kl") && written("restart.latent_kl=0.5").contains("latent_kl = 0.5"));
 }
 
 proptest! {

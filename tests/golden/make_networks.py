@@ -26,7 +26,7 @@ from torch.nn import functional
 LEVEL_MAX = 40
 STATE, ACTION = 3, 2
 LOG_VAR = (-8.0, 2.0)
-SPREAD = {"log_var": 20.0, "prior.4": 6.0}
+SPREAD = {"log_var": 20.0, "prior.4": 6.0, "baseline.surprise": 8.0}
 
 Tensors = dict[str, Tensor]
 
@@ -325,7 +325,7 @@ def run(network: nn.Module, given: Tensors) -> Tensors:
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             parameter += 0.1 * torch.randn_like(parameter)
-            # So that some log-variances reach their bounds, and others do not.
+            # So that some log-variances and surprises reach their bounds, and others do not.
             parameter *= next((factor for part, factor in SPREAD.items() if part in name), 1.0)
             parameter.copy_(parameter.half())
     given = {name: value.half().double() for name, value in given.items()}
@@ -335,13 +335,20 @@ def run(network: nn.Module, given: Tensors) -> Tensors:
     results = network(given)
     assert "log_var" not in results or all((results["log_var"] == bound).any() for bound in LOG_VAR)
     weights = {name: torch.randn(y.shape).half().double() for name, y in results.items()}
-    torch.stack([(y * weights[name]).sum() for name, y in results.items()]).sum().backward()
+    total = torch.stack([(y * weights[name]).sum() for name, y in results.items()]).sum()
+    if total.requires_grad:
+        total.backward()
     out = {f"in.{name}": value for name, value in given.items()}
-    out |= {f"d.{name}": given[name].grad for name in varied}
+    out |= {f"d.{name}": gradient(given[name]) for name in varied}
     out |= {f"y.{name}": value for name, value in results.items()} | {f"r.{name}": value for name, value in weights.items()}
     for name, parameter in network.named_parameters():
-        out |= {f"p.{our_name(name)}": parameter, f"dp.{our_name(name)}": parameter.grad}
+        out |= {f"p.{our_name(name)}": parameter, f"dp.{our_name(name)}": gradient(parameter)}
     return out
+
+
+def gradient(leaf: Tensor) -> Tensor:
+    """Zero where no result depends on it."""
+    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
 
 
 def process() -> Tensors:
@@ -372,15 +379,20 @@ def process() -> Tensors:
     return {"process.alphas40": alpha, "process.alphas150": alphas(150), "process.jumps": torch.stack(rows)}
 
 
-def main() -> None:
-    torch.manual_seed(0)
-    torch.set_default_dtype(torch.float64)
-    out = process()
-    for case, (network, given) in cases().items():
+def save(path: Path, cases: dict[str, tuple[nn.Module, Tensors]], beside: Tensors | None = None) -> None:
+    """Runs all cases and writes what came of them, and what stands beside them."""
+    out = dict(beside or {})
+    for case, (network, given) in cases.items():
         out |= {f"{case}.{name}": value for name, value in run(network, given).items()}
     exact = {name for name in out if name.split(".")[1] in {"in", "r", "p"}}
     held = {name: (value.half() if name in exact else value.float()).detach().contiguous() for name, value in out.items()}
-    save_file(held, Path(__file__).with_name("networks.safetensors"))
+    save_file(held, path)
+
+
+def main() -> None:
+    torch.manual_seed(0)
+    torch.set_default_dtype(torch.float64)
+    save(Path(__file__).with_name("networks.safetensors"), cases(), process())
 
 
 if __name__ == "__main__":

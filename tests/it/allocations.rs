@@ -52,7 +52,7 @@ fn agent(latent: GruLatent, backbone: Backbone, obs_horizon: usize) -> Agent {
         config.trained.action_horizons = vec![1];
     }
     // Every warm act is noised again a little.
-    config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e7, latent_jump: f32::INFINITY };
+    config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e7, latent_jump: f32::INFINITY, ..Restart::default() };
     let fresh = Params::fresh(1);
     Networks::new(config.layout, &config.method, &fresh).unwrap();
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();

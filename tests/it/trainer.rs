@@ -208,7 +208,7 @@ fn mistakes_get_one_clear_line() {
         (trainer, vec!["run", "nowhere.toml"], "nowhere.toml"),
         (trainer, vec!["inspect", to], "manifest.json"),
         (trainer, vec!["inspect", broken.to_str().unwrap()], "config.json"),
-        (trainer, vec!["defaults", "models/tiny", to, "--set", "sampler.kapa=1"], "sampler has no kapa"),
+        (trainer, vec!["defaults", "models/tiny", to, "--set", "sampler.kapa=1"], "unknown field `kapa`"),
         (server, vec!["--models", "nowhere"], "models.dir nowhere"),
         (server, vec!["--models", "models", "--default-model", "nobody", "--listen", "127.0.0.1:0"], "there are: cheetah-vel-e"),
         (server, vec!["--set", "engine.wrokers=2"], "wrokers"),

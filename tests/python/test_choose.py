@@ -137,11 +137,14 @@ def test_the_grid_holds_the_checkpoints_own_values_and_what_it_can_do() -> None:
     assert len(grid({}, replace(FACTS, streams=False))) == 6
     given = grid({"kappa": "inf", "temperature": "0", "latent_jump": "0.3, inf", "cold_distance": "1.5", "eta": "0,1"}, FACTS)
     assert len(given) == 2 + 4 and given[-1].overrides()[-2:] == ["restart.cold_distance=1.5", "restart.latent_jump=inf"]
+    nats = grid({**dict.fromkeys(("kappa", "temperature", "cold_distance"), "1"), "latent_jump": "inf", "latent_kl": "0.3, inf"}, FACTS)
+    assert [one.overrides()[-1] for one in nats[1:]] == ["restart.latent_kl=0.3", "restart.latent_kl=inf"] and len(nats) == 3
     assert "sampler.kappa=inf" in given[0].overrides() and "sampler.streaming=false" in given[0].overrides()
     for words, names in [
         ({"streaming": "true"}, "cold is the reference"),
         ({"latent_jump": "-1"}, "latent_jump"),
         ({"latent_jump": "nan"}, "latent_jump"),
+        ({"latent_kl": "-0.1"}, "latent_kl"),
         ({"jump": "1"}, "no such option: jump"),
         ({"action_horizon": "1,2"}, "one action_horizon"),
     ]:
@@ -157,6 +160,7 @@ def test_what_the_trainer_says_of_a_checkpoint_is_understood() -> None:
     facts = Facts.of(json.loads(told.stdout)["config"])
     assert facts.streams and facts.latent and facts.refined
     assert (facts.own["latent_jump"], facts.own["kappa"], facts.own["streaming"], facts.own["latent"]) == ("0.6", "0.1", "true", "mean")
+    assert facts.own["latent_kl"] == "inf", "what is not named is off"
 
 
 def test_episodes_in_parts_are_the_same_as_in_one(address: str) -> None:

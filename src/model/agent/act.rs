@@ -44,8 +44,8 @@ pub struct Act {
     started: bool,
     start: Start,
     latents: Chain,
-    /// Mean of the prior latent of position 0 at the last cold start.
-    anchor: Vec<f32>,
+    /// Belief of position 0 at the last cold start: a chain of one.
+    anchor: Chain,
     descent: Descent,
 }
 
@@ -66,7 +66,7 @@ impl Act {
             started: false,
             start: Start::Cold,
             latents: Chain::new(plan.horizon + options.action_horizon - 1, dim),
-            anchor: vec![0.0; dim],
+            anchor: Chain::new(1, dim),
             descent: Descent::new(sampling, state, [plan.horizon, config.layout.dim()]),
             episode,
         }
@@ -112,20 +112,18 @@ impl Act {
 
     /// Resident size in bytes, beside its own: the copy of the episode, and the working memory.
     pub fn size_bytes(&self) -> usize {
-        self.episode.size_bytes() + self.latents.size_bytes() + self.descent.size_bytes() + self.anchor.capacity() * size_of::<f32>()
+        self.episode.size_bytes() + self.latents.size_bytes() + self.descent.size_bytes() + self.anchor.size_bytes()
     }
 
     /// Chooses between the stored window and a cold start, and fills the window.
     pub(super) fn start(&mut self, config: &ModelConfig, walk: Walk) {
         self.started = true;
-        let latent = (!self.latents.is_empty()).then(|| self.latents.get(0).mean);
+        let belief = self.latents.get(0);
         let rung = self.descent.rung();
-        self.start = self.stored().map_or(Start::Cold, |stored| choose_start(stored, self.descent.known(), latent, rung, config));
+        self.start = self.stored().map_or(Start::Cold, |stored| choose_start(stored, self.descent.known(), belief, rung, config));
         match (self.start, self.episode.take_stored()) {
             (Start::Cold, _) | (_, None) => {
-                if let Some(mean) = latent {
-                    self.anchor.copy_from_slice(mean);
-                }
+                self.anchor.set(0, belief);
                 self.descent.begin_cold(walk);
             }
             (Start::Warm, Some(stored)) => self.resume(&stored, 0, walk),
@@ -134,7 +132,7 @@ impl Act {
     }
 
     fn resume(&mut self, stored: &Stored, rows: usize, walk: Walk) {
-        self.anchor.copy_from_slice(stored.anchor());
+        self.anchor.set(0, stored.anchor());
         self.descent.begin_with(stored.window(), rows, walk);
     }
 
@@ -158,7 +156,7 @@ impl Act {
         }
         let Some(stored) = self.episode.take_stored() else { return false };
         (self.started, self.start) = (true, Start::Warm);
-        self.anchor.copy_from_slice(stored.anchor());
+        self.anchor.set(0, stored.anchor());
         self.descent.give_as_it_is(stored.window(), walk);
         true
     }

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 /// Distributions of the latents from the act's first position on, `T + action_horizon - 1` of them; without any for a model without
 /// latents.
-#[derive(Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Chain {
     mean: Vec<f32>,
     log_var: Vec<f32>,
@@ -54,7 +54,7 @@ impl Chain {
         at..at + self.dim
     }
 
-    /// The latent of a position of the window.
+    /// The latent of a position of the window; without any, of no columns.
     pub(super) fn get(&self, position: usize) -> GaussianRef<'_> {
         let range = self.range(position);
         GaussianRef { mean: &self.mean[range.clone()], log_var: &self.log_var[range] }

@@ -27,7 +27,7 @@ fn agent(latents: bool, obs_horizon: usize, denoiser: Backbone) -> Agent {
     let latent = latents.then_some(GruLatent::plain(5, 16, Looks::Block(4)));
     let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, latent, denoiser);
     config.units.normalizer.state = Affine { mean: vec![0.5, 0.0, -0.5], std: vec![2.0, 1.0, 0.5] };
-    config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY };
+    config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY, ..Restart::default() };
     config.trained.sub_steps = (1..=10).collect();
     config.method.plan.obs_horizon = obs_horizon;
     let networks = Networks::new(config.layout, &config.method, &Params::fresh(3)).unwrap();
@@ -141,13 +141,48 @@ fn a_warm_act_continues_the_ladder() {
 fn surprise_and_latent_jumps_restart() {
     let mut agent = agent(true, 1, unet());
     let start_of_second = |agent: &Agent| run(agent, 1, &options(), 2)[1].start;
-    agent.config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e6, latent_jump: f32::INFINITY };
+    agent.config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e6, latent_jump: f32::INFINITY, ..Restart::default() };
     assert_eq!(start_of_second(&agent), Start::Renoised(2));
     assert_eq!(run(&agent, 1, &options(), 2)[1].evaluations, 3);
-    agent.config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 0.0, latent_jump: f32::INFINITY };
+    agent.config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 0.0, latent_jump: f32::INFINITY, ..Restart::default() };
     assert_eq!(start_of_second(&agent), Start::Cold);
-    agent.config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e6, latent_jump: 0.0 };
+    agent.config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e6, latent_jump: 0.0, ..Restart::default() };
     assert_eq!(start_of_second(&agent), Start::Cold);
+    let patient = Restart { renoise_distance: 1e6, cold_distance: 1e6, latent_jump: f32::INFINITY, ..Restart::default() };
+    agent.config.defaults.restart = Restart { latent_kl: 0.0, ..patient };
+    assert_eq!(start_of_second(&agent), Start::Cold);
+    agent.config.defaults.restart = patient;
+    assert_eq!(start_of_second(&agent), Start::Warm);
+}
+
+/// What a belief is held against is that of the last cold start, mean and log-variance, however many warm acts there were since, and what an
+/// act without time handed on.
+#[test]
+fn the_anchor_is_the_belief_of_the_last_cold_start() {
+    let mut agent = agent(true, 1, unet());
+    let mut stream = Philox::new(5);
+    // Without a refinement the latent of a chunk is the filter's, which windows are begun by.
+    let mut episode = agent.open(1, &SamplerOptions { kappa: 0.0, ..options() }).unwrap();
+    let mut last = (vec![], vec![]);
+    for (latent_kl, expected) in
+        [(0.0, Start::Cold), (f32::INFINITY, Start::Warm), (f32::INFINITY, Start::Warm), (0.0, Start::Cold), (1e6, Start::Warm)]
+    {
+        agent.config.defaults.restart.latent_kl = latent_kl;
+        let (next, chunk) = agent.act(&episode, &observation(&mut stream)).unwrap();
+        assert_eq!(chunk.start, expected);
+        let now = (chunk.latent_mean, chunk.latent_log_var);
+        assert!(now.0 != last.0 && now.1 != last.1, "what is seen moves both");
+        if expected == Start::Cold {
+            last = now;
+        }
+        let anchor = next.stored().unwrap().anchor();
+        assert_eq!((anchor.mean, anchor.log_var), (last.0.as_slice(), last.1.as_slice()));
+        let mut cut = agent.begin(&next, &observation(&mut stream)).unwrap();
+        assert!(agent.cut_short(&mut cut));
+        let (handed_on, _) = agent.finish(cut).unwrap();
+        assert_eq!(handed_on.stored().unwrap().anchor(), anchor);
+        episode = next;
+    }
 }
 
 /// The trust region: 0 leaves the filter's latent, infinity takes the posterior's, and a little moves it a little.

@@ -1,7 +1,7 @@
 //! The latent networks on both kinds of values, and against PyTorch's.
 
 use super::{
-    elbo::{Ahead, ElboBatch, ElboOptions},
+    elbo::{Ahead, ElboBatch, ElboOptions, ElboTerms},
     *,
 };
 use crate::model::{
@@ -12,9 +12,13 @@ use crate::model::{
     trajectory::Token,
 };
 use candle_core::Tensor;
+use std::collections::BTreeMap;
+
+mod baseline;
 
 const LAYOUT: Layout = Layout { state_dim: 3, action_dim: 2 };
 const LEN: usize = 5;
+const CHANGE_STD: [f32; 3] = [0.5, 1.0, 2.0];
 
 fn model() -> LatentModel {
     let (config, fresh) = (GruLatent::plain(6, 24, Looks::Block(4)), Params::fresh(4));
@@ -101,32 +105,31 @@ fn networks_against_pytorch() {
     golden.check_serving(|params| everything(&tokens_of::<Buffer>(|name| golden.value(&format!("in.{name}"))), params));
 }
 
-/// The ELBO and its gradients.
-#[test]
-fn elbo_against_pytorch() {
-    let options = ElboOptions {
+fn elbo_options() -> ElboOptions {
+    ElboOptions {
         kl_weight: 0.3,
-        state_change_std: vec![0.5, 1.0, 2.0],
+        state_change_std: CHANGE_STD.to_vec(),
         state_weight: 1.0,
         reward_weight: 0.7,
         action_weight: 0.6,
         free_bits: 0.0,
         context_weight: 0.0,
         ahead: Ahead::default(),
-    };
+    }
+}
+
+/// A batch of the inputs of a golden case.
+fn elbo_batch(given: &BTreeMap<String, Tensor>) -> ElboBatch {
+    let [valid, history_shown, successor_shown, eps] = ["valid", "history_shown", "successor_shown", "eps"].map(|name| given[name].clone());
+    let tokens = tokens_of(|name| given[name].clone());
+    ElboBatch { tokens, valid, history_shown, successor_shown, eps, context: None, believed: given.get("believed").cloned() }
+}
+
+/// The ELBO and its gradients.
+#[test]
+fn elbo_against_pytorch() {
     Golden::of("elbo").check_training(|given, params| {
-        let [valid, history_shown, successor_shown, eps] =
-            ["valid", "history_shown", "successor_shown", "eps"].map(|name| given[name].clone());
-        let batch = ElboBatch {
-            tokens: tokens_of(|name| given[name].clone()),
-            valid,
-            history_shown,
-            successor_shown,
-            eps,
-            context: None,
-            believed: None,
-        };
-        let terms = LatentModel::new(&golden_latent(2, 7), LAYOUT, params)?.elbo(&batch, &options)?;
+        let terms = LatentModel::new(&golden_latent(2, 7), LAYOUT, params)?.elbo(&elbo_batch(given), &elbo_options())?;
         let named = [("loss", terms.loss), ("state_error", terms.state_error), ("reward_error", terms.reward_error), ("kl", terms.kl)];
         Ok(named.map(|(name, term)| (name.into(), term)).into())
     });

@@ -97,8 +97,8 @@ impl Recipe {
     pub fn to_toml(&self) -> String {
         let data = self.data.file_name().unwrap_or(self.data.as_os_str()).to_string_lossy().into_owned().into();
         let mut table = toml::Table::try_from(Self { data, ..self.clone() }).expect("a recipe came from TOML: is a bug");
-        // Infinity is serialised as null, which JSON needs and TOML leaves out.
-        let Restart { renoise_distance, cold_distance, latent_jump } = self.restart;
+        // Infinity is serialised as null, which JSON needs and TOML leaves out; of `latent_kl` it is what is meant where nothing is said.
+        let Restart { renoise_distance, cold_distance, latent_jump, latent_kl: _ } = self.restart;
         for (section, key, value) in [
             ("sampler", "kappa", self.sampler.kappa),
             ("restart", "renoise_distance", renoise_distance),

@@ -60,7 +60,7 @@ is the refined one, which the window itself had a part in; --set kappa=0 shows t
 models/README.md are of seeds from 1000 on). No server need run: the grid has keys of [restart], which no session can choose, so
 variants of the checkpoint are written to a temporary folder and served on loopback while the command runs. The grid is streaming,
 kappa, temperature, latent_jump and cold_distance, with the checkpoint's own values and some on either side; --set takes the place of a
-key's values (renoise_distance and the other sampling options too).
+key's values (latent_kl, renoise_distance and the other sampling options too).
 {choose.RULE}
 A setting that is more than two standard errors below the best cold one after a quarter of the episodes is run no further (far below), nor
 is one that needs more evaluations than one that qualifies (dearer).

@@ -24,7 +24,7 @@ GRID = {
     "cold_distance": ["0.75", "1.5"],
 }
 #: Settings of a checkpoint alone: when a streaming window is not trusted any more. A session cannot choose them.
-RESTART = ("renoise_distance", "cold_distance", "latent_jump")
+RESTART = ("renoise_distance", "cold_distance", "latent_jump", "latent_kl")
 #: Fewer evaluations an act than this are no difference.
 EVALUATIONS_ALIKE = 0.1
 #: A setting is run no further when it is so many standard errors below the best cold one.
@@ -77,7 +77,8 @@ class Facts:
     def of(cls, config: Mapping[str, Any]) -> Facts:
         """From the config of `ada-trainer inspect --json`, where infinity is null."""
         defaults, method = config["defaults"], config["method"]
-        own = {**defaults["sampler"], **defaults["restart"]}
+        # Null is infinity, and what is not named is off.
+        own = dict.fromkeys(RESTART) | defaults["sampler"] | defaults["restart"]
         return cls(
             {name: word(float("inf") if value is None else value) for name, value in own.items()},
             method["plan"]["schedule"]["kind"] == "ladder",
