@@ -14,9 +14,11 @@ fn baseline(params: &Params) -> candle_core::Result<Baseline> {
 
 /// Surprises, and where they mean something: the results of the golden case, by name.
 fn surprises<V: Activations>(tokens: &Tokens<V>, params: &Params) -> candle_core::Result<Vec<(String, V)>> {
-    let Surprises { state, action, reward } = baseline(params)?.surprises(tokens)?;
+    let Surprises { state, action, reward } = baseline(params)?.surprises(tokens, true)?;
     let told = tokens.before.as_ref().unwrap().told.clone();
-    Ok([("state", state), ("action", action), ("reward", reward), ("told", told)].map(|(name, value)| (name.into(), value)).into())
+    Ok([("state", state), ("action", action.expect("is asked for")), ("reward", reward), ("told", told)]
+        .map(|(name, value)| (name.into(), value))
+        .into())
 }
 
 /// The tokens of the golden case as an act packs them: what is absent is not there at all.
