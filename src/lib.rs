@@ -52,7 +52,7 @@
 //! | a layer: its shape, forward and backward | [`model::nn`], `op.rs` and one file a layer; loops in `kernels` |
 //! | what the latent found of the context, and what there was to find | [`train::probe`], `docs/identification.md` |
 //! | what is minimized, and which networks move | [`train::recipe::stages`], [`train::recipe::losses`] |
-//! | a batch cut from episodes | [`train::dataset::window`] |
+//! | which episodes a loss draws from; a batch cut from them, over the border of a session too | [`train::dataset::Which`], [`train::dataset::window`] |
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
 //! | an option of a session, from the wire to the sampler | `serve/wire.rs`, [`model::options`] |
 //!
