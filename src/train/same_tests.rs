@@ -183,7 +183,7 @@ fn assert_same(agent: &Agent, one: &WindowBatch, [trained, ready]: [&[Vec<f32>; 
 fn begun(agent: &Agent, one: &WindowBatch, start: usize) -> crate::model::agent::Episode {
     let fresh = agent.open(1, &agent.config().defaults.sampler).unwrap();
     let earlier = history_len(one, 0).saturating_sub(start);
-    let shows_any = numbers(&one.history.present, 0)[..3 * earlier].iter().any(|flag| *flag == 1.0);
+    let shows_any = numbers(&one.history.present, 0)[..3 * earlier].contains(&1.0);
     if earlier == 0 || !(shows_any || one.history_lens.is_some()) {
         return fresh;
     }
