@@ -300,6 +300,60 @@ def test_short_episodes_are_left_out_and_said(tmp_path):
     assert "left out 1 of 13 episodes" in told.stderr and json.loads(told.stdout)
 
 
+def of_episodes(values: Any) -> np.ndarray:
+    """One value for each episode, in all of its steps."""
+    return np.repeat(np.asarray(values), STEPS)
+
+
+def test_play_is_learned_from_and_not_imitated(tmp_path):
+    """What each loss draws from shows in its first value: all episodes, those of play, those to imitate."""
+    play = {"infos/play": of_episodes(np.arange(EPISODES) % 2 == 0)}
+    few = [
+        "--set",
+        "stages.identify.steps=2",
+        "--set",
+        "stages.denoise.steps=2",
+        "--set",
+        "log_every=1",
+        "--set",
+        "stages.denoise.trains.latent=0",
+    ]
+
+    def first(name: str, columns: Arrays, *flags: str) -> tuple[float, float]:
+        done = train(write(tmp_path / f"{name}.h5", columns), tmp_path / name, *few, *flags)
+        assert done.returncode == 0 and ("6 of them are play, which is not imitated" in done.stderr) == ("infos/play" in columns), (
+            done.stderr
+        )
+        lines = [json.loads(line) for line in (tmp_path / name / "training/log.jsonl").read_text().splitlines()]
+        return tuple(next(line[key] for line in lines if key in line) for key in ("elbo", "loss"))
+
+    plain, marked = first("plain", arrays()), first("marked", arrays() | play)
+    drawn = first("drawn", arrays() | play, "--set", "losses.elbo.episodes=play")
+    assert plain[0] == marked[0] != drawn[0], "the ELBO"
+    assert plain[1] != marked[1], "the planner"
+
+
+def test_what_is_play_is_said_for_whole_episodes_and_leaves_something_to_imitate(tmp_path):
+    mixed = of_episodes(np.zeros(EPISODES, np.bool_))
+    mixed[3 * STEPS + 2] = True
+    words = f"`infos/play`: changes at row {3 * STEPS + 2}, within the episode that begins at row {3 * STEPS}"
+    assert words in refusal(write(tmp_path / "mixed.h5", arrays() | {"infos/play": mixed}), tmp_path / "mixed")
+    for value, flags, key in ((True, [], "losses.denoise"), (False, ["--set", "losses.elbo.episodes=play"], "losses.elbo.episodes")):
+        columns = arrays() | {"infos/play": of_episodes(np.full(EPISODES, value))}
+        done = train(write(tmp_path / "x.h5", columns), tmp_path / f"{value}", *flags)
+        assert done.returncode == 1 and f"recipe: `{key}`: of the episodes" in done.stderr and "infos/play" in done.stderr, done.stderr
+
+
+def test_episodes_of_a_session_follow_one_another(plain, tmp_path):
+    """Histories then cross the border, which changes what is learned; numbered one by one, nothing does."""
+    alone = arrays() | {"infos/session": of_episodes(np.arange(EPISODES))}
+    assert log(write(tmp_path / "alone.h5", alone), tmp_path / "alone") == plain
+    paired = arrays() | {"infos/session": of_episodes(np.arange(EPISODES) // 2)}
+    assert log(write(tmp_path / "paired.h5", paired), tmp_path / "paired") != plain
+    sessions = [json.loads((tmp_path / name / "config.json").read_text())["trained"].get("sessions", False) for name in ("alone", "paired")]
+    assert sessions == [False, True]
+
+
 def strange(dtype: Any) -> Callable[[h5py.File, np.ndarray], None]:
     return lambda file, values: file.create_dataset("actions", values.shape, dtype) and None
 

@@ -79,6 +79,19 @@ fn check_a_reset_keeps_the_memory(agent: &Agent) {
     assert_eq!(latent(false), agent.act(&agent.open(1, &options()).unwrap(), &told(0..0)).unwrap().1.latent_mean);
 }
 
+/// What training never saw is refused, and the old episode is as it was.
+#[test]
+fn a_history_is_kept_only_where_training_kept_one() {
+    let trained = running();
+    let mut config = trained.config.clone();
+    config.trained.sessions = false;
+    let networks = Networks::new(config.layout, &config.method, &Params::fresh(3)).unwrap();
+    let untrained = Agent::new(config, networks, "alone".into());
+    let (episode, _) = untrained.act(&untrained.open(1, &options()).unwrap(), &told(0..4)).unwrap();
+    assert!(matches!(untrained.reset(&episode, 1, true), Err(AgentError::HistoryNotKept)));
+    assert!(untrained.reset(&episode, 1, false).is_ok() && trained.reset(&episode, 1, true).is_ok());
+}
+
 /// What it would need to wait for, or to leave for the next act, it does not have.
 #[test]
 fn what_a_method_does_not_have_is_refused() {
