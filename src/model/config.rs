@@ -96,8 +96,8 @@ pub struct Restart {
     /// It starts cold when the latent of position 0 has moved by more than this many `latent_spread`s since the last cold start.
     #[serde(with = "infinity_as_null")]
     pub latent_jump: f32,
-    /// It starts cold when KL(belief of position 0 now || that at the last cold start) exceeds so many nats: the yardstick is the belief's own
-    /// width, and so the same for every checkpoint. Off where it is not named.
+    /// It starts cold when KL(belief of position 0 now || that at the last cold start) exceeds so many nats: the yardstick is the width of
+    /// the belief itself, not the spread of the data. Off where it is not named.
     #[serde(default = "never", skip_serializing_if = "is_never", with = "infinity_as_null")]
     pub latent_kl: f32,
 }
