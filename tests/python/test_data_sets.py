@@ -350,6 +350,10 @@ def test_episodes_of_a_session_follow_one_another(plain, tmp_path):
     assert log(write(tmp_path / "alone.h5", alone), tmp_path / "alone") == plain
     paired = arrays() | {"infos/session": of_episodes(np.arange(EPISODES) // 2)}
     assert log(write(tmp_path / "paired.h5", paired), tmp_path / "paired") != plain
+    one = arrays() | {"infos/session": of_episodes(np.zeros(EPISODES, np.int64))}
+    assert "`infos/session`: all episodes are of one session" in refusal(write(tmp_path / "one.h5", one), tmp_path / "one")
+    stamps = arrays() | {"infos/session": of_episodes(1_700_000_000 + np.arange(EPISODES))}
+    assert "`infos/session`: has the number 17000000" in refusal(write(tmp_path / "stamps.h5", stamps), tmp_path / "stamps")
     sessions = [json.loads((tmp_path / name / "config.json").read_text())["trained"].get("sessions", False) for name in ("alone", "paired")]
     assert sessions == [False, True]
 

@@ -67,8 +67,12 @@ impl Episode {
         if keep_history {
             fresh.history.clone_from(&self.history);
             fresh.memory.clone_from(&self.memory);
-            fresh.history.push_back(Token::default());
-            fresh.unread = self.unread + usize::from(!fresh.memory.is_empty());
+            fresh.unread = self.unread;
+            // Where nothing was lived there is no border, however often it is reset.
+            if self.time > 0 {
+                fresh.history.push_back(Token::default());
+                fresh.unread += usize::from(!fresh.memory.is_empty());
+            }
         }
         fresh
     }

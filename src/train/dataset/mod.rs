@@ -194,13 +194,17 @@ impl Dataset {
         Ok(())
     }
 
-    /// Splits by sessions, mostly of one episode, drawn once and for all seeds alike, and brings them to units. What was chosen for the columns of actions is
-    /// told beside it; with the units of a checkpoint nothing is chosen.
+    /// Splits by sessions, mostly of one episode, drawn once and for all seeds alike, and brings them to units. What was chosen for the
+    /// columns of actions is told beside it; with the units of a checkpoint nothing is chosen.
     ///
     /// # Errors
-    /// If the bounds wished for do not fit the columns, or rows are kept in a file and it cannot be read.
+    /// If all episodes are of one session, the bounds wished for do not fit the columns, or rows are kept in a file and it cannot be read.
     pub fn split(self, from: UnitsFrom) -> Result<(Split, Vec<ActionColumn>), DatasetError> {
         let mut order: Vec<&[Span]> = self.episodes.chunk_by(|_, next| next.before.is_some()).collect();
+        if order.len() < 2 {
+            let reason = "all episodes are of one session, and sessions are held out as a whole: two are needed at least".into();
+            return Err(DatasetError::Invalid { path: self.path.clone(), field: "infos/session".into(), reason });
+        }
         let mut rng = Philox::new(SPLIT_SEED);
         for last in (1..order.len()).rev() {
             order.swap(last, rng.below(last + 1));

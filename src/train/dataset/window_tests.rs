@@ -18,6 +18,11 @@ fn episodes() -> Vec<Episode> {
     vec![episode(1, 9), episode(2, 12)]
 }
 
+/// Of eight tokens, nothing hidden.
+fn block_shape(batch: usize, looks: Looks) -> BlockShape {
+    BlockShape { batch, len: 8, looks, latent_dim: 2, stays: false, context: None, show_action: 0.5, show_reward: 0.5, hide: Hide::NOTHING }
+}
+
 fn row_of(standing: &Standing) -> usize {
     match standing {
         Standing::Row(row) => *row,
@@ -32,17 +37,7 @@ fn rows(tensor: &Tensor) -> Vec<Vec<Vec<f32>>> {
 #[test]
 fn blocks_run_into_an_episode_and_never_out_of_it() {
     let episodes = episodes();
-    let shape = BlockShape {
-        batch: 200,
-        len: 8,
-        looks: Looks::Block(3),
-        latent_dim: 2,
-        stays: false,
-        context: None,
-        show_action: 0.5,
-        show_reward: 0.5,
-        hide: Hide::NOTHING,
-    };
+    let shape = block_shape(200, Looks::Block(3));
     let places = shape.places(&episodes);
     let batch = blocks(&episodes, &places, &shape, &mut Philox::new(1)).unwrap();
     let (states, present) = (rows(&batch.tokens.state), rows(&batch.tokens.present));
@@ -238,17 +233,7 @@ fn before_an_episode_lies_a_border_and_the_one_that_it_follows() {
 fn blocks_cross_the_border() {
     let episodes = vec![following()];
     for looks in [Looks::Block(3), Looks::Running] {
-        let shape = BlockShape {
-            batch: 400,
-            len: 8,
-            looks,
-            latent_dim: 2,
-            stays: false,
-            context: None,
-            show_action: 0.5,
-            show_reward: 0.5,
-            hide: Hide::NOTHING,
-        };
+        let shape = block_shape(400, looks);
         let batch = blocks(&episodes, &shape.places(&episodes), &shape, &mut Philox::new(1)).unwrap();
         let (states, present, valid) = (rows(&batch.tokens.state), rows(&batch.tokens.present), batch.valid.to_vec2::<f32>().unwrap());
         let mut crossed = 0;

@@ -79,6 +79,18 @@ fn check_a_reset_keeps_the_memory(agent: &Agent) {
     assert_eq!(latent(false), agent.act(&agent.open(1, &options()).unwrap(), &told(0..0)).unwrap().1.latent_mean);
 }
 
+/// A client that resets over and over finds one border, and no more memory taken, than one that resets once.
+#[test]
+fn nothing_lived_leaves_no_border() {
+    let agent = running();
+    let fresh = agent.open(1, &options()).unwrap();
+    assert_eq!(agent.reset(&fresh, 1, true).unwrap(), fresh);
+    let (lived, _) = agent.act(&fresh, &told(0..4)).unwrap();
+    let once = agent.reset(&lived, 1, true).unwrap();
+    let often = (0..100).fold(once.clone(), |episode, _| agent.reset(&episode, 1, true).unwrap());
+    assert_eq!((&often, often.history().len()), (&once, lived.history().len() + 1));
+}
+
 /// What training never saw is refused, and the old episode is as it was.
 #[test]
 fn a_history_is_kept_only_where_training_kept_one() {

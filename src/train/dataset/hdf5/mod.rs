@@ -36,6 +36,8 @@ const CONTEXT: &str = "infos/context";
 const PLAY: &str = "infos/play";
 /// Number of the session of an episode: consecutive episodes of one follow one another.
 const SESSION: &str = "infos/session";
+/// Whole numbers below it are exact in 32 bits; a time stamp is not.
+const SESSION_MAX: f32 = 16_777_216.0;
 /// Bytes of a piece that is read at once, or one row of chunks where that is more: so every chunk is unpacked once.
 const PIECE_BYTES: usize = 1 << 20;
 /// Layout class of a virtual data set.
@@ -74,12 +76,17 @@ pub fn read(path: &Path, room: &Room) -> Result<Dataset, DatasetError> {
     }
     let of_episodes = |array: &Option<Array>| array.as_ref().map(|array| arrays.of_episodes(array, &rows_of)).transpose();
     let (play, session) = (of_episodes(&play)?, of_episodes(&session)?);
+    if let Some(number) = session.iter().flatten().find(|number| number.abs() >= SESSION_MAX) {
+        let reason =
+            format!("has the number {number}, but from {SESSION_MAX} on numbers are rounded and may look alike: count sessions from 0");
+        return Err(arrays.invalid(SESSION, reason));
+    }
     let follows = |index: usize| session.as_ref().is_some_and(|session| index > 0 && session[index - 1] == session[index]);
     let episode = |(index, rows): (usize, &Range<usize>)| Span {
         rows: rows.clone(),
         play: play.as_ref().is_some_and(|play| play[index] != 0.0),
         // What came of an episode's last act no other act tells.
-        before: follows(index).then(|| rows_of[index - 1].start..rows_of[index - 1].end - 1),
+        before: follows(index).then(|| rows_of[index - 1].start..rows_of[index - 1].end - 1).filter(|before| !before.is_empty()),
     };
     let episodes = rows_of.iter().enumerate().map(episode).collect();
     let columns: usize = [&observations, &actions, &rewards].into_iter().chain(&context).map(|array| array.width).sum();
