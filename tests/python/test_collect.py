@@ -248,6 +248,7 @@ def test_a_blind_expert_is_searched_for_kept_and_used_again(tmp_path):
         (["--env", "point-wind-s", "--blind", "1.5"], "--blind"),
         (["--env", "point-wind-s", "--blind", "nan"], "--blind"),
         (["--env", "point-wind-s", "--play", "1"], "--play"),
+        (["--env", "Pendulum-v1", "--expert", "random", "--play", "0.5"], "--play"),
         (["--env", "point-wind-s", "--play", "0.6", "--blind", "0.5"], "--play"),
         (["--env", "point-wind-s", "--blind-expert", "random"], "--blind"),
         (["--env", "Pendulum-v1", "--expert", "random", "--blind", "0.5"], "--blind-expert"),

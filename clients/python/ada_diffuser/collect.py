@@ -159,6 +159,8 @@ def _fly(
     observation, _ = env.reset(seed=seed)
     if other:
         other.begin(session=seed is not None)
+        if other.context is None:
+            raise ValueError(f"--play: {env.spec.id} has no hidden context that an expert could be told falsely")
     _check_fit(env, expert)  # not before: what a class draws in `reset` need not be there earlier
     low, high = env.action_space.low, env.action_space.high
     steps: list[tuple[Any, ...]] = []
