@@ -89,7 +89,7 @@ impl Crank<'_> {
     /// the state is saved: what is logged of it is then neither lost nor told twice by a run that is killed in between.
     fn turn(&mut self, learner: &mut Learner) -> Result<Outcome> {
         let (task, steps) = (self.task, self.stage(learner).steps);
-        let objective = Objective::new(task, learner.position.stage);
+        let objective = Objective::new(task, learner.position.stage).prepared(&learner.networks)?;
         self.log.begin(&learner.position, steps);
         while learner.position.step < steps {
             if self.should_stop() {
@@ -142,11 +142,13 @@ impl Crank<'_> {
     fn passes_gate(&mut self, learner: &mut Learner) -> Result<bool> {
         let (task, stage) = (self.task, &self.task.recipe.stages[learner.position.stage]);
         let Some(latent) = learner.networks.latent.as_ref().filter(|_| stage.identifies()) else { return Ok(true) };
-        let held_out = Objective::new(task, learner.position.stage).held_out(&learner.networks)?;
+        let objective = Objective::new(task, learner.position.stage);
+        let (held_out, learned_from) = (objective.held_out(&learner.networks)?, objective.learned_from(&learner.networks)?);
         let tells = task.split.episodes.train[0].context_dim > 0;
         let context = tells.then(|| -> Result<_> { Ok((gate::probe(task, latent)?, gate::held_by_tokens(task)?)) }).transpose()?;
         let beside_baseline = latent.baseline.is_some();
-        self.log.say(&sentence(&Found { held_out: &held_out, beside_baseline, looks: task.looks(), context }));
+        let found = Found { held_out: &held_out, learned_from: &learned_from, beside_baseline, looks: task.looks(), context };
+        self.log.say(&sentence(&found));
         let Some((result, _)) = context else { return Ok(true) };
         let successor_state = result.successor_state.map(|error| ("probe_successor_state", error));
         let probed: Vec<_> = [("probe_filter", result.filter)].into_iter().chain(successor_state).collect();

@@ -98,6 +98,8 @@ pub struct Task {
     pub context_units: Affine,
     /// What a person should know about the data.
     pub notes: Vec<String>,
+    /// Where rows may be kept.
+    pub room: Room,
 }
 
 impl Task {
@@ -127,7 +129,7 @@ impl Task {
         // The recipe was checked with plain units; now the data's are known.
         config.check().with_context(|| format!("data set {} makes no model", recipe.data.display()))?;
         let context_units = units_of_context(&split.episodes.train, tells)?;
-        let task = Self { context_units, recipe, split, action_columns, dataset_digest, config, notes };
+        let task = Self { context_units, recipe, split, action_columns, dataset_digest, config, notes, room: room.clone() };
         if let Some(key) = task.recipe.probe_key() {
             ensure!(
                 gate::contexts_vary(&task)?,

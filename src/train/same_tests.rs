@@ -3,8 +3,10 @@
 
 use super::{
     dataset::{
-        Episode, Span,
+        Episode, Sides, Span,
         hidden::Hide,
+        room::Room,
+        surprises::surprising,
         window::{Levels, Places, WindowShape, windows},
     },
     *,
@@ -16,6 +18,7 @@ use crate::model::{
         refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
         schedule::Table,
     },
+    latent,
     method::{Actions, Backbone, Baseline, Future, GruLatent, LatentSource, Looks, Schedule},
     nn::Params,
     noise::Philox,
@@ -121,7 +124,26 @@ fn check(config: &ModelConfig, hide: Hide) {
 
 /// The same of episodes that follow others of so many steps.
 fn check_after(before: usize, config: &ModelConfig, hide: Hide) {
-    let (agent, episodes, plan) = (agent(config), episodes(before), &config.method.plan);
+    let agent = agent(config);
+    check_with(&agent, &episodes(before), config, hide);
+    if let Some(baseline) = agent.networks().latent.as_ref().and_then(|latent| latent.baseline.as_ref()) {
+        check_with(&agent, &surprised(episodes(before), baseline), config, hide);
+    }
+}
+
+/// Each told how surprising its steps are, beforehand, as training finds that out once.
+fn surprised(episodes: Vec<Episode>, baseline: &latent::Baseline) -> Vec<Episode> {
+    let told = |episode| {
+        let sides = Sides { train: vec![episode], held_out: Vec::new() };
+        surprising(&sides, baseline, &Room::default()).unwrap().train.remove(0)
+    };
+    let told: Vec<Episode> = episodes.into_iter().map(told).collect();
+    assert!(told.iter().all(Episode::tells_surprises));
+    told
+}
+
+fn check_with(agent: &Agent, episodes: &[Episode], config: &ModelConfig, hide: Hide) {
+    let plan = &config.method.plan;
     let (sampler, latents_free) = (&config.defaults.sampler, config.method.latent.gru().is_none());
     let shape = WindowShape {
         batch: BATCH,
@@ -136,9 +158,9 @@ fn check_after(before: usize, config: &ModelConfig, hide: Hide) {
     };
     let options =
         RefineOptions { routing: LatentRouting::Matched, first_action_weight: 1.0, sub_steps: sampler.sub_steps, moves_latents: true };
-    let (places, mut seen_rows) = (Places::new(&episodes, 0, plan.horizon), std::collections::BTreeSet::new());
+    let (places, mut seen_rows) = (Places::new(episodes, 0, plan.horizon), std::collections::BTreeSet::new());
     for seed in 0..12 {
-        let batch = windows(&episodes, &places, &shape, None, &mut Philox::new(seed)).unwrap();
+        let batch = windows(episodes, &places, &shape, None, &mut Philox::new(seed)).unwrap();
         for row in 0..BATCH {
             let one = batch.narrow(row, 1).unwrap();
             let trained = agent.networks().read_in_training(plan, &one, &options).unwrap();
@@ -146,12 +168,12 @@ fn check_after(before: usize, config: &ModelConfig, hide: Hide) {
             let at_ready = shape.table.ready().map_or(at, |ready| ready.min(at));
             let ready = WindowBatch { at: vec![Standing::Row(at_ready)], ..batch.narrow(row, 1).unwrap() };
             let [x_ready, ..] = agent.networks().read_in_training(plan, &ready, &options).unwrap();
-            let (_, start) = place(&episodes, &one, 0);
+            let (_, start) = place(episodes, &one, 0);
             if start < one.imagined[0] {
                 // No act has given out more than it has lived through.
                 continue;
             }
-            assert_same(&agent, &one, [&trained, &[x_ready, Vec::new(), Vec::new(), Vec::new()]], start);
+            assert_same(agent, &one, [&trained, &[x_ready, Vec::new(), Vec::new(), Vec::new()]], start);
             seen_rows.insert(at);
         }
     }

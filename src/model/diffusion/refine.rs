@@ -252,6 +252,7 @@ fn window_tokens(batch: &WindowBatch, x: &Tensor, seen: &[Seen], sigma: Option<&
         noise: sigma.map_or(Ok(zeros), |sigma| sigma.narrow(1, 0, len)?.contiguous())?,
         present,
         before: None,
+        surprises: None,
     })
 }
 

@@ -1,6 +1,6 @@
 //! Evidence lower bound over a block (equation of section 4.2; appendix A.4).
 
-use super::{Baseline, Gaussian, LatentModel, Surprises, Tokens};
+use super::{Gaussian, LatentModel, Surprises, Tokens};
 use crate::model::trajectory::{Layout, Seen};
 use candle_core::{Device, Result, Tensor};
 use serde::{Deserialize, Serialize};
@@ -83,13 +83,12 @@ impl LatentModel {
     /// # Errors
     /// If widths differ.
     pub fn posteriors(&self, tokens: &Tokens, history_shown: &Tensor, successor_shown: &Tensor) -> Result<Gaussian> {
-        self.posteriors_beside(self.surprises(tokens)?.as_ref(), tokens, history_shown, successor_shown)
+        self.posteriors_beside(self.facts(tokens)?.as_ref(), tokens, history_shown, successor_shown)
     }
 
-    /// How far each token of a block is from what was expected: facts, of which the encoder is shown some and the decoders have to explain all.
-    fn surprises(&self, tokens: &Tokens) -> Result<Option<Surprises>> {
-        let of = |baseline: &Baseline| baseline.surprises(&tokens.clone().following(None)?, true);
-        self.baseline.as_ref().map(of).transpose()
+    /// How far each token of a block is from what was expected: of this the encoder is shown some and the decoders have to explain all.
+    fn facts(&self, tokens: &Tokens) -> Result<Option<Surprises>> {
+        self.surprises(&self.noticed(tokens.clone(), None)?, true)
     }
 
     fn posteriors_beside(
@@ -126,7 +125,7 @@ impl LatentModel {
     /// # Errors
     /// If shapes differ.
     pub fn elbo(&self, batch: &ElboBatch, options: &ElboOptions) -> Result<ElboTerms> {
-        let surprises = self.surprises(&batch.tokens)?;
+        let surprises = self.facts(&batch.tokens)?;
         let Explained { q, from } = self.explained(surprises.as_ref(), batch)?;
         let (latent, stays) = self.drawn(&q, batch, from)?;
         let steps = Steps::new(batch, surprises.as_ref(), from, options)?;

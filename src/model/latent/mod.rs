@@ -112,8 +112,13 @@ impl LatentModel {
 
     /// States of the GRU after each token, `(B, L, hidden)`.
     fn states<V: Activations>(&self, tokens: &Tokens<V>, before: Option<&V>) -> Result<V> {
-        let surprises = self.baseline.as_ref().map(|baseline| baseline.surprises(tokens, self.encoder.sees_actions())).transpose()?;
-        self.encoder.states(tokens, surprises.as_ref(), before)
+        self.encoder.states(tokens, self.surprises(tokens, self.encoder.sees_actions())?.as_ref(), before)
+    }
+
+    /// How far tokens are from what was expected, if anybody expects something: as was found out beforehand, or by the baseline.
+    fn surprises<V: Activations>(&self, tokens: &Tokens<V>, at_actions: bool) -> Result<Option<Surprises<V>>> {
+        let of = |baseline: &Baseline| tokens.surprises.clone().map_or_else(|| baseline.surprises(tokens, at_actions), Ok);
+        self.baseline.as_ref().map(of).transpose()
     }
 
     /// Tokens with what came before each, if anybody looks at it; see [`Tokens::following`].

@@ -137,5 +137,5 @@ fn elbo_against_pytorch() {
 
 fn tokens_of<V>(value: impl Fn(&str) -> V) -> Tokens<V> {
     let [state, action, reward, present, noise] = ["state", "action", "reward", "present", "noise"].map(value);
-    Tokens { state, action, reward, present, noise, before: None }
+    Tokens { state, action, reward, present, noise, before: None, surprises: None }
 }

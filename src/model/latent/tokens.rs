@@ -1,5 +1,6 @@
 //! Tokens of a batch of sequences, side by side: what the encoder reads.
 
+use super::Surprises;
 use crate::model::{
     nn::Activations,
     trajectory::{Layout, TokenRef},
@@ -21,6 +22,8 @@ pub struct Tokens<V = Tensor> {
     pub noise: V,
     /// What came before each, where anybody looks at it ([`super::Baseline`]).
     pub before: Option<Before<V>>,
+    /// How surprising each is, where that was found out beforehand: of recorded steps, beside a baseline that learns no more.
+    pub surprises: Option<Surprises<V>>,
 }
 
 /// The token before each token.
@@ -95,6 +98,7 @@ impl<V: Activations> Tokens<V> {
                     })
                 })
                 .transpose()?,
+            surprises: None,
         })
     }
 
@@ -126,7 +130,8 @@ impl Tokens {
             reward: change(&self.reward)?,
             present: change(&self.present)?,
             noise: change(&self.noise)?,
-            before: self.before.as_ref().map(|before| before.map(change)).transpose()?,
+            before: self.before.as_ref().map(|before| before.map(&change)).transpose()?,
+            surprises: self.surprises.as_ref().map(|surprises| surprises.map(&change)).transpose()?,
         })
     }
 
@@ -161,7 +166,7 @@ impl Tokens {
         let (batch, len) = self.batch_len()?;
         let chosen: Vec<f32> = index.iter().flat_map(|index| (0..len).map(move |at| f32::from(Some(at) == *index))).collect();
         let chosen = Tensor::from_vec(chosen, (batch, 1, len), self.state.device())?;
-        Self { before: None, ..self.clone() }.map(|column| chosen.matmul(column))
+        Self { before: None, surprises: None, ..self.clone() }.map(|column| chosen.matmul(column))
     }
 
     /// Of one sequence, `(1, L)`, the tokens at these places as rows of their own, `(n, 1)`; nothing that is known where there is no place.
@@ -169,7 +174,7 @@ impl Tokens {
     /// # Errors
     /// If a place lies outside.
     pub fn pick(&self, places: &[Option<usize>]) -> Result<Self> {
-        Self { before: None, ..self.clone() }.map(|column| pick(column, places))
+        Self { before: None, surprises: None, ..self.clone() }.map(|column| pick(column, places))
     }
 
     /// Positions `start..start + len` of every row.
@@ -180,7 +185,7 @@ impl Tokens {
         self.map(|tensor| tensor.narrow(1, start, len)?.contiguous())
     }
 
-    /// These tokens followed by others, row by row; what came before them is not known any more.
+    /// These tokens followed by others, row by row; what came before them, and how surprising they are, is not known any more.
     ///
     /// # Errors
     /// If batch sizes or widths differ.
@@ -193,6 +198,7 @@ impl Tokens {
             present: join(&self.present, &next.present)?,
             noise: join(&self.noise, &next.noise)?,
             before: None,
+            surprises: None,
         })
     }
 }

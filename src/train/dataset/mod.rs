@@ -3,6 +3,7 @@ pub mod hdf5;
 pub mod hidden;
 pub mod room;
 pub mod rows;
+pub mod surprises;
 pub mod units;
 pub mod window;
 

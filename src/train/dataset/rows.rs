@@ -208,6 +208,8 @@ pub struct Episode {
     /// Whether it shows what comes of actions and is nothing to imitate.
     pub play: bool,
     fields: Arc<Fields>,
+    /// How surprising each row of the fields is, where that was found out; see [`super::surprises`].
+    surprises: Option<Arc<Field>>,
     rows: Range<usize>,
     before: Option<Range<usize>>,
 }
@@ -215,7 +217,38 @@ pub struct Episode {
 impl Episode {
     /// The rows of `span`.
     pub fn new(fields: &Arc<Fields>, Span { rows, play, before }: Span) -> Self {
-        Self { layout: fields.layout(), context_dim: fields.context.width, play, fields: fields.clone(), rows, before }
+        let (layout, context_dim) = (fields.layout(), fields.context.width);
+        Self { layout, context_dim, play, fields: fields.clone(), surprises: None, rows, before }
+    }
+
+    /// Other rows of the same data set.
+    pub(super) fn of_rows(&self, span: Span) -> Self {
+        Self::new(&self.fields, span)
+    }
+
+    /// The same episode, whose steps tell their surprises, which are rows beside those of the data set.
+    pub(super) fn telling(&self, surprises: &Arc<Field>) -> Self {
+        Self { surprises: Some(surprises.clone()), ..self.clone() }
+    }
+
+    /// Whether its steps tell their surprises.
+    pub fn tells_surprises(&self) -> bool {
+        self.surprises.is_some()
+    }
+
+    /// The row of the data set that follows its last.
+    pub(super) fn end(&self) -> usize {
+        self.rows.end
+    }
+
+    /// Numbers in a row of the data set.
+    pub(super) fn columns(&self) -> usize {
+        self.layout.dim() + 1 + self.context_dim
+    }
+
+    /// Whether rows of the data set are kept in a file.
+    pub(super) fn in_file(&self) -> bool {
+        matches!(self.fields.states.home, Home::File(_))
     }
 
     /// An episode of its own from states, actions, rewards and context.
@@ -279,7 +312,12 @@ impl Episode {
     pub fn step(&self, t: isize) -> io::Result<Option<Step<'_>>> {
         let Some(row) = self.row(t) else { return Ok(None) };
         let Fields { states, actions, rewards, .. } = &*self.fields;
-        Ok(Some(Step { state: states.rows(row..row + 1)?, action: actions.rows(row..row + 1)?, reward: rewards.rows(row..row + 1)?[0] }))
+        Ok(Some(Step {
+            state: states.rows(row..row + 1)?,
+            action: actions.rows(row..row + 1)?,
+            reward: rewards.rows(row..row + 1)?[0],
+            surprise: self.surprises.as_ref().map(|surprises| surprises.rows(row..row + 1)).transpose()?,
+        }))
     }
 
     /// s_t.
@@ -323,6 +361,8 @@ pub struct Step<'a> {
     pub action: Cow<'a, [f32]>,
     /// r_t.
     pub reward: f32,
+    /// How surprising state, action and reward are, side by side, where that was found out.
+    pub surprise: Option<Cow<'a, [f32]>>,
 }
 
 #[cfg(test)]

@@ -1,12 +1,12 @@
 //! Batches: blocks for the ELBO and windows to denoise, cut from episodes at drawn places.
 
-use super::{Episode, hidden::Hide, rows::Step};
+use super::{Episode, hidden::Hide, rows::Step, surprises};
 use crate::model::{
     diffusion::{
         refine::{Standing, WindowBatch},
         schedule::Table,
     },
-    latent::{Tokens, elbo::ElboBatch},
+    latent::{Surprises, Tokens, elbo::ElboBatch},
     method::Looks,
     noise::Philox,
     normalizer::Affine,
@@ -22,12 +22,15 @@ pub struct TokenRows {
     action: Vec<f32>,
     reward: Vec<f32>,
     present: Vec<f32>,
+    /// Of episodes that tell them.
+    surprise: Option<Vec<f32>>,
 }
 
 impl TokenRows {
-    /// No rows yet.
-    pub fn new(layout: Layout) -> Self {
-        Self { layout, state: Vec::new(), action: Vec::new(), reward: Vec::new(), present: Vec::new() }
+    /// No rows yet, of episodes that tell what this one tells.
+    pub fn new(episode: &Episode) -> Self {
+        let surprise = episode.tells_surprises().then(Vec::new);
+        Self { layout: episode.layout, state: Vec::new(), action: Vec::new(), reward: Vec::new(), present: Vec::new(), surprise }
     }
 
     /// Appends x_t of an episode, wholly absent where there is no such step.
@@ -35,7 +38,7 @@ impl TokenRows {
     /// # Errors
     /// If the episode cannot be read.
     pub fn push(&mut self, episode: &Episode, t: isize, seen: Seen) -> io::Result<()> {
-        let Some(Step { state, action, reward }) = episode.step(t)? else {
+        let Some(Step { state, action, reward, surprise }) = episode.step(t)? else {
             self.push_absent();
             return Ok(());
         };
@@ -44,6 +47,9 @@ impl TokenRows {
         self.state.extend(state.iter().map(|value| value * flags[0]));
         self.action.extend(action.iter().map(|value| value * flags[1]));
         self.reward.push(reward * flags[2]);
+        if let (Some(all), Some(one)) = (&mut self.surprise, surprise) {
+            all.extend_from_slice(&one);
+        }
         Ok(())
     }
 
@@ -54,6 +60,9 @@ impl TokenRows {
         self.state.extend(std::iter::repeat_n(0.0, state_dim));
         self.action.extend(std::iter::repeat_n(0.0, action_dim));
         self.reward.push(0.0);
+        if let Some(all) = &mut self.surprise {
+            all.extend(std::iter::repeat_n(0.0, surprises::width(self.layout)));
+        }
     }
 
     /// `batch` rows of `len` tokens each.
@@ -62,13 +71,21 @@ impl TokenRows {
     /// If there are not as many tokens.
     pub fn tokens(self, batch: usize, len: usize) -> Result<Tokens> {
         let tensor = |values: Vec<f32>, width: usize| Tensor::from_vec(values, (batch, len, width), &Device::Cpu);
+        let Layout { state_dim, action_dim } = self.layout;
+        let split = |all: Tensor| {
+            let part = |start, width| all.narrow(2, start, width)?.contiguous();
+            let (state, action, reward) = (part(0, state_dim)?, part(state_dim, action_dim)?, part(state_dim + action_dim, 1)?);
+            Ok::<_, candle_core::Error>(Surprises { state, action: Some(action), reward })
+        };
+        let surprises = self.surprise.map(|all| split(tensor(all, surprises::width(self.layout))?)).transpose()?;
         Ok(Tokens {
             noise: Tensor::zeros((batch, len, 1), candle_core::DType::F32, &Device::Cpu)?,
-            state: tensor(self.state, self.layout.state_dim)?,
-            action: tensor(self.action, self.layout.action_dim)?,
+            state: tensor(self.state, state_dim)?,
+            action: tensor(self.action, action_dim)?,
             reward: tensor(self.reward, 1)?,
             present: tensor(self.present, 3)?,
             before: None,
+            surprises,
         })
     }
 }
@@ -169,7 +186,7 @@ fn drawn(episodes: &[Episode], places: &Places, rng: &mut Philox) -> (Episode, i
 /// If an episode cannot be read.
 pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &mut Philox) -> Result<ElboBatch> {
     let steps = shape.len - 1;
-    let mut rows = TokenRows::new(episodes[0].layout);
+    let mut rows = TokenRows::new(&episodes[0]);
     let (mut valid, mut history) = (Vec::with_capacity(shape.batch * steps), Vec::with_capacity(shape.batch * shape.len * 3));
     let (mut successor, mut context) = (Vec::with_capacity(shape.batch * steps * 3), Vec::new());
     for _ in 0..shape.batch {
@@ -351,7 +368,7 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
 /// If an episode cannot be read.
 pub fn histories(places: &[(&Episode, isize)], looks: Looks, seen: impl Fn(usize, usize) -> Seen) -> Result<(Tokens, Option<Vec<usize>>)> {
     let Some((first, _)) = places.first() else { candle_core::bail!("no places: is a bug") };
-    let mut rows = TokenRows::new(first.layout);
+    let mut rows = TokenRows::new(first);
     match looks {
         Looks::Block(len) => {
             for (row, (episode, t)) in places.iter().enumerate() {

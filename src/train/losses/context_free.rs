@@ -114,7 +114,7 @@ fn baseline(networks: &Networks) -> Result<&Baseline> {
 
 /// Tokens at these places and one later.
 fn transitions(episodes: &[Episode], places: &[(usize, usize)]) -> Result<Tokens> {
-    let mut rows = TokenRows::new(episodes[0].layout);
+    let mut rows = TokenRows::new(&episodes[0]);
     for (episode, t) in places {
         (*t..t + 2).try_for_each(|t| rows.push(&episodes[*episode], t as isize, Seen::ALL))?;
     }

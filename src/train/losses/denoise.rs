@@ -27,6 +27,9 @@ use std::ops::Range;
 /// Held-out windows for each row of the ladder.
 const HELD_OUT_WINDOWS: usize = 256;
 
+/// Play is nothing to imitate.
+const IMITATED: Which = Which::Demonstrations;
+
 /// Parts of a batch whose gradients are computed side by side. A fixed number: another one adds up in another order, and a run must end
 /// in the same bytes on every machine.
 const SHARDS: usize = 2;
@@ -78,8 +81,13 @@ impl<'a> DenoiseLoss<'a> {
             sub_steps: sampler.sub_steps,
             moves_latents,
         };
-        let episodes = task.split.episodes.only(Which::Demonstrations);
+        let episodes = task.split.episodes.only(IMITATED);
         Self { task, weight, places: shape.places(&episodes.train), shape, episodes, options }
+    }
+
+    /// Draws from these episodes, which are the task's own and may tell more.
+    pub(super) fn look_at(&mut self, episodes: &Sides) {
+        self.episodes = episodes.only(IMITATED);
     }
 
     /// Draws the batch of a step; a job for each shard.

@@ -9,7 +9,7 @@ use crate::model::{
 use crate::train::{
     Task,
     dataset::{
-        HELD_OUT_SEED, Sides,
+        Episode, HELD_OUT_SEED, Sides,
         window::{BlockShape, Places, blocks},
     },
     learner::Scalars,
@@ -18,7 +18,7 @@ use crate::train::{
 use anyhow::{Context, Result};
 use candle_core::Tensor;
 
-/// Blocks of the held-out loss.
+/// Blocks of what is measured.
 const HELD_OUT_BLOCKS: usize = 256;
 
 /// Draws blocks and evaluates the loss.
@@ -54,6 +54,11 @@ impl<'a> ElboLoss<'a> {
         let before = earlier.iter().filter(|stage| stage.weight(Loss::Elbo) > 0.0).map(|stage| stage.steps).sum();
         let episodes = task.split.episodes.only(config.episodes);
         Some(Self { task, config, weight, before, places: shape.places(&episodes.train), shape, episodes })
+    }
+
+    /// Draws from these episodes, which are the task's own and may tell more.
+    pub(super) fn look_at(&mut self, episodes: &Sides) {
+        self.episodes = episodes.only(self.config.episodes);
     }
 
     /// Draws the batch of this step of the stage.
@@ -102,13 +107,6 @@ impl<'a> ElboLoss<'a> {
     /// # Errors
     /// If a tensor operation fails.
     pub fn held_out(&self, networks: &Networks) -> Result<Scalars> {
-        let (episodes, shape) = (&self.episodes.held_out, BlockShape { batch: HELD_OUT_BLOCKS, ..self.shape.clone() });
-        let places = shape.places(episodes);
-        if places.is_empty() {
-            return Ok(Vec::new());
-        }
-        let batch = blocks(episodes, &places, &shape, &mut Philox::new(HELD_OUT_SEED))?;
-        let (_, means) = self.evaluate(networks, &batch, self.config.kl_weight.end)?;
         let held_out = |name| match name {
             "elbo" => "held_out_elbo",
             "state_error" => "held_out_state_error",
@@ -118,6 +116,26 @@ impl<'a> ElboLoss<'a> {
             "context_error" => "held_out_context_error",
             _ => "held_out_kl",
         };
-        Ok(means.into_iter().map(|mean| (held_out(mean.name), mean.sum)).collect())
+        let errors = self.measured(networks, &self.episodes.held_out)?;
+        Ok(errors.into_iter().map(|(name, error)| (held_out(name), error)).collect())
+    }
+
+    /// The same of as many blocks of the episodes that it learns from.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn learned_from(&self, networks: &Networks) -> Result<Scalars> {
+        self.measured(networks, &self.episodes.train)
+    }
+
+    fn measured(&self, networks: &Networks, episodes: &[Episode]) -> Result<Scalars> {
+        let shape = BlockShape { batch: HELD_OUT_BLOCKS, ..self.shape.clone() };
+        let places = shape.places(episodes);
+        if places.is_empty() {
+            return Ok(Vec::new());
+        }
+        let batch = blocks(episodes, &places, &shape, &mut Philox::new(HELD_OUT_SEED))?;
+        let (_, means) = self.evaluate(networks, &batch, self.config.kl_weight.end)?;
+        Ok(means.into_iter().map(|mean| (mean.name, mean.sum)).collect())
     }
 }

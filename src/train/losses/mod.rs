@@ -7,9 +7,13 @@ pub mod elbo;
 
 use super::{
     Task,
+    dataset::surprises::surprising,
     learner::{Learner, Scalars},
     parallel::side_by_side,
-    recipe::{losses::Loss, stages::Stage},
+    recipe::{
+        losses::Loss,
+        stages::{Group, Stage},
+    },
 };
 use crate::model::{Networks, noise::Philox};
 use anyhow::Result;
@@ -55,6 +59,20 @@ impl<'a> Objective<'a> {
             elbo: ElboLoss::of_stage(task, stage),
             context_free: ContextFreeLoss::of_stage(task, stage),
         }
+    }
+
+    /// Finds out once how surprising every recorded step is, of a stage that leaves the baseline as it is: its batches then need not ask again.
+    ///
+    /// # Errors
+    /// If an episode cannot be read, the disk is full, or a tensor operation fails.
+    pub fn prepared(mut self, networks: &Networks) -> Result<Self> {
+        let baseline = networks.latent.as_ref().and_then(|latent| latent.baseline.as_ref());
+        let stays = !self.stage.trains.contains_key(&Group::Baseline);
+        let Some(baseline) = baseline.filter(|_| stays && (self.denoise.is_some() || self.elbo.is_some())) else { return Ok(self) };
+        let episodes = surprising(&self.task.split.episodes, baseline, &self.task.room)?;
+        self.denoise.iter_mut().for_each(|loss| loss.look_at(&episodes));
+        self.elbo.iter_mut().for_each(|loss| loss.look_at(&episodes));
+        Ok(self)
     }
 
     /// One optimizer step, and one of the average.
@@ -110,6 +128,14 @@ impl<'a> Objective<'a> {
             scalars.push(("held_out_context_free", context_free.held_out(networks)?));
         }
         Ok(scalars)
+    }
+
+    /// Of the ELBO the same on the episodes that it learns from: what is much better there is known by heart.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn learned_from(&self, networks: &Networks) -> Result<Scalars> {
+        self.elbo.as_ref().map_or_else(|| Ok(Vec::new()), |elbo| elbo.learned_from(networks))
     }
 
     /// What of these losses on held-out episodes the stage minimizes, in one number; none where it has no held-out loss.

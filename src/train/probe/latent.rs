@@ -34,7 +34,7 @@ fn posteriors(
     let together = |a: &Place, b: &Place| looks != Looks::Running || a.0 == b.0;
     for chunk in places.chunk_by(together).flat_map(|places| places.chunks(CHUNK)) {
         let pasts: Vec<_> = chunk.iter().map(|(episode, t)| (&episodes[*episode], *t as isize)).collect();
-        let mut ahead = TokenRows::new(pasts[0].0.layout);
+        let mut ahead = TokenRows::new(pasts[0].0);
         for (episode, t) in &pasts {
             evidence.ahead().iter().zip(*t..).try_for_each(|(seen, at)| ahead.push(episode, at, *seen))?;
         }
@@ -44,7 +44,7 @@ fn posteriors(
             Looks::Running => {
                 let (episode, reach) = (pasts[0].0, pasts[0].0.reach());
                 let (at, len) = (chunk.iter().map(|(_, t)| reach + t).collect::<Vec<_>>(), reach + episode.len());
-                let mut whole = TokenRows::new(episode.layout);
+                let mut whole = TokenRows::new(episode);
                 (0..len).try_for_each(|t| whole.push(episode, t as isize - reach as isize, Seen::ALL))?;
                 latent.infer_within(&whole.tokens(1, len)?, &at, &ahead)?
             }
