@@ -65,13 +65,19 @@ fn by_heart(found: &Found) -> Option<f64> {
     Some(learned).filter(|_| found.beside_baseline && lost > LITTLE && lost > BY_HEART * learned)
 }
 
+/// Whether one look at the state tells a part of the context that is worth a word.
+fn told_by_state(held: &Held) -> bool {
+    held.state < POOR
+}
+
 /// What the raw tokens hold, by the steps that the encoder looks at.
 fn there_is(held: &Held, looks: Looks) -> String {
     let whole = format!("{:.3}", held.whole_past);
-    match looks {
+    let tokens = match looks {
         Looks::Running => format!("raw tokens hold {whole}"),
         Looks::Block(len) => format!("raw tokens hold {:.3} in {len} steps, {whole} in all of the past", held.looked_at),
-    }
+    };
+    if told_by_state(held) { format!("{tokens}, the state at that moment alone {:.3}", held.state) } else { tokens }
 }
 
 /// The key to turn first: that without which the others do not help.
@@ -80,6 +86,9 @@ fn advice(found: &Found, explains_little: bool) -> String {
     let block = found.looks != Looks::Running;
     if held.is_some_and(|held| held.looked_at.min(held.whole_past) > POOR) {
         "the data themselves tell little of the context; record more action noise, a sensor more, or longer episodes before turning any key"
+    } else if found.beside_baseline && held.is_some_and(|held| told_by_state(&held)) {
+        "the state itself tells much of the context, and the baseline has read it there, so that a latent is asked for the rest alone; see \
+         \"latent and state\" in ada-trainer probe for what a decision knows of it"
     } else if block && held.is_some_and(|held| held.looked_at > POOR && held.whole_past < LONGER * held.looked_at) {
         "it takes more steps to tell, as of a context that stays; try model.latent.looks = \"running\" first"
     } else if !found.beside_baseline {
@@ -110,7 +119,7 @@ mod tests {
     fn told(errors: &Scalars, beside_baseline: bool, looks: Looks, context: Option<[f64; 3]>) -> String {
         let context = context.map(|[filter, looked_at, whole_past]| {
             let probed = Probed { filter, successor_state: None };
-            (probed, Held { looked_at, whole_past })
+            (probed, Held { looked_at, whole_past, state: 0.9 })
         });
         sentence(&Found { held_out: errors, learned_from: &Vec::new(), beside_baseline, looks, context })
     }
@@ -148,7 +157,7 @@ mod tests {
     #[test]
     fn it_says_what_is_known_by_heart() {
         let told = |learned: f64, held_out: f64, beside_baseline| {
-            let context = Some((Probed { filter: 0.7, successor_state: None }, Held { looked_at: 0.2, whole_past: 0.2 }));
+            let context = Some((Probed { filter: 0.7, successor_state: None }, Held { looked_at: 0.2, whole_past: 0.2, state: 0.9 }));
             let (held_out, learned_from) = (vec![("held_out_state_error", held_out)], vec![("state_error", learned)]);
             sentence(&Found { held_out: &held_out, learned_from: &learned_from, beside_baseline, looks: Looks::Running, context })
         };
@@ -158,5 +167,18 @@ mod tests {
             assert!(!told(learned, held_out, true).contains("by heart"), "{learned} {held_out}");
         }
         assert!(!told(0.67, 0.94, false).contains("by heart"));
+    }
+
+    /// As in the gale, where the speed of what is blown tells the wind.
+    #[test]
+    fn it_says_what_the_state_tells() {
+        let told = |state: f64, beside_baseline| {
+            let context = Some((Probed { filter: 0.7, successor_state: None }, Held { looked_at: 0.2, whole_past: 0.2, state }));
+            let held_out = vec![("held_out_state_error", 0.9)];
+            sentence(&Found { held_out: &held_out, learned_from: &Vec::new(), beside_baseline, looks: Looks::Running, context })
+        };
+        let gale = told(0.34, true);
+        assert!(gale.contains("raw tokens hold 0.200, the state at that moment alone 0.340. That is little: the state itself"), "{gale}");
+        assert!(!told(0.9, true).contains("state itself") && !told(0.34, false).contains("state itself"));
     }
 }

@@ -43,6 +43,12 @@ impl Table {
         Self { width: columns.len(), values: rows.flat_map(|row| &row[columns.clone()]).copied().collect() }
     }
 
+    /// Rows of both, side by side.
+    pub fn beside(&self, other: &Self) -> Self {
+        let rows = (0..self.rows()).flat_map(|row| self.row(row).iter().chain(other.row(row)));
+        Self { width: self.width + other.width, values: rows.copied().collect() }
+    }
+
     fn moments(&self) -> (Vec<f64>, Vec<f64>) {
         let count = self.rows().max(1) as f64;
         let mut mean = vec![0.0; self.width];

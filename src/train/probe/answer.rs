@@ -1,6 +1,6 @@
 //! What `ada-trainer probe` finds and prints: a table for people, rows for `report/identification.json`.
 
-use super::{AGES, Age, Score, Source, Subjects, ceiling, latent_probe, prior_probe, probed};
+use super::{AGES, Age, Score, Source, Subjects, beside_state, ceiling, latent_probe, prior_probe, probed};
 use crate::{
     model::{checkpoint, latent::Evidence, method::Looks},
     train::dataset::{UnitsFrom, hdf5, room::Room},
@@ -77,6 +77,12 @@ pub struct Row {
     pub ceiling: Option<f64>,
     /// The same of the raw tokens but for their actions.
     pub ceiling_without_actions: Option<f64>,
+    /// The same of the state at that moment alone; of a filter.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub state: Option<f64>,
+    /// The same of the latent beside that state.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mse_with_state: Option<f64>,
 }
 
 /// Probes a checkpoint against a data set: block lengths 1, 2, 4 and T_x, every evidence, shifts -1, 0, 1, the roll-out, and the ceilings.
@@ -110,6 +116,7 @@ pub fn probe(question: &Question, room: &Room) -> Result<Answer> {
             scores.extend(latent_probe(latent, &subjects, *evidence, looks, &SHIFTS)?);
         }
     }
+    scores.extend(beside_state(latent, &subjects, looks)?);
     scores.extend(prior_probe(latent, &subjects, looks, ahead)?);
     let block_lens: Vec<usize> = shorter(looks).into_iter().map(Looks::block_len).collect();
     let block_lens: &[usize] = if looks == Looks::Running { &CEILINGS } else { &block_lens };
@@ -183,6 +190,8 @@ impl Answer {
             mse: of(score),
             ceiling: beside(Source::Ceiling),
             ceiling_without_actions: beside(Source::CeilingWithoutActions),
+            state: beside(Source::State),
+            mse_with_state: beside(Source::LatentAndState),
         }
     }
 
@@ -208,6 +217,7 @@ standardised mean squared error (1 - R2) of a linear probe for the hidden contex
   shift            the estimate at t is held against the context at t + shift; least beside 0: the latent lags or hurries
   ceiling          what the raw tokens hold: ridge regression on each transition, then over those seen; \"no actions\": without any, since
                    an expert's tell the context that it sees (but a push that is not known also hides what the context did)
+  state            what the state at t tells by itself; latent and state: both together, as a decision reads them
   error            where all of the block lies in the episode; beside it by age, in steps since the episode began, each with a probe of its own
 
 ";
@@ -218,6 +228,8 @@ fn line(score: &Score) -> String {
         Source::Latent => "latent",
         Source::Ceiling => "ceiling",
         Source::CeilingWithoutActions => "ceiling, no actions",
+        Source::State => "state",
+        Source::LatentAndState => "latent and state",
     };
     let evidence = if *ahead > 0 { "prior" } else { seen(score.evidence) };
     let looks = match looks {

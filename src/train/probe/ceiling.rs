@@ -13,6 +13,7 @@ use super::{
     past::Past,
     places,
     score::{self, score},
+    state::told_by_state,
     steps, stride,
 };
 use crate::{
@@ -33,7 +34,7 @@ const FIT_ROWS: usize = 12_000;
 const HELD_ROWS: (usize, usize) = (4_000, 100_000);
 /// Transitions whose features are made at once.
 const CHUNK: usize = 4096;
-/// Transitions with more columns than this get linear features only.
+/// What has more columns than this gets linear features only.
 const QUADRATIC_COLUMNS_MAX: usize = 64;
 /// Estimates that the filter over the whole past has one by one, at the least.
 const LAGS_MIN: usize = 10;
@@ -71,6 +72,8 @@ pub struct Held {
     pub looked_at: f64,
     /// Over the whole past of the episode.
     pub whole_past: f64,
+    /// By the state at that moment alone.
+    pub state: f64,
 }
 
 /// The ceilings that a sentence names: from fewer places and, of a large data set, some of its episodes, so that it takes seconds.
@@ -82,7 +85,8 @@ pub fn held(subjects: &Subjects, looks: Looks) -> io::Result<Held> {
     let subjects = Subjects { train: &train, held_out: &held_out, rows_max: subjects.rows_max };
     let filter = Filter::new(&subjects, Source::Ceiling, (HELD_ROWS.0, looks.block_len().max(LAGS_MIN)))?;
     let error = |past| -> io::Result<f64> { Ok(filter.scores((past, looks), Evidence::Filter, 0..=0)?[0].errors.whole) };
-    Ok(Held { looked_at: error(looks)?, whole_past: error(Looks::Running)? })
+    let state = told_by_state(&subjects, HELD_ROWS.0)?;
+    Ok(Held { looked_at: error(looks)?, whole_past: error(Looks::Running)?, state })
 }
 
 /// Episodes evenly among these, of about so many steps together at most.
@@ -157,18 +161,22 @@ fn transitions(source: Source, episodes: &[Episode], places: &[Place]) -> io::Re
         let (state, action, reward, next) = (episode.state(*t)?, episode.action(*t)?, episode.reward(*t)?, episode.state(t + 1)?);
         let action: &[f32] = if source == Source::CeilingWithoutActions { &[] } else { &action };
         let parts = [&*state, action, &[reward], &*next];
-        let columns: Vec<f64> = parts.into_iter().flatten().map(|value| f64::from(*value)).collect();
-        features.values.extend(&columns);
-        features.width = columns.len();
-        if columns.len() <= QUADRATIC_COLUMNS_MAX {
-            for (i, a) in columns.iter().enumerate() {
-                features.values.extend(columns[i..].iter().map(|b| a * b));
-            }
-            features.width += columns.len() * (columns.len() + 1) / 2;
-        }
+        quadratic(&parts.into_iter().flatten().map(|value| f64::from(*value)).collect::<Vec<_>>(), &mut features);
         truth.values.extend(episode.context(*t)?.iter().map(|value| f64::from(*value)));
     }
     Ok((features, truth))
+}
+
+/// Appends a row of these columns, and of their products unless they are too many.
+pub(super) fn quadratic(columns: &[f64], features: &mut Table) {
+    features.values.extend(columns);
+    features.width = columns.len();
+    if columns.len() <= QUADRATIC_COLUMNS_MAX {
+        for (i, a) in columns.iter().enumerate() {
+            features.values.extend(columns[i..].iter().map(|b| a * b));
+        }
+        features.width += columns.len() * (columns.len() + 1) / 2;
+    }
 }
 
 #[cfg(test)]
@@ -233,7 +241,9 @@ mod tests {
             match source {
                 Source::Ceiling if looks == Looks::Running => assert!(errors.ages[1] < 0.01 && errors.ages[2] < 0.01, "{score:?}"),
                 Source::Ceiling => assert!(errors.whole < 1e-3, "{score:?}"),
-                Source::CeilingWithoutActions | Source::Latent => assert!(errors.whole > 0.9 && errors.ages[1] > 0.9, "{score:?}"),
+                Source::CeilingWithoutActions | Source::Latent | Source::State | Source::LatentAndState => {
+                    assert!(errors.whole > 0.9 && errors.ages[1] > 0.9, "{score:?}")
+                }
             }
         }
     }

@@ -6,12 +6,14 @@ mod ceiling;
 mod latent;
 mod past;
 mod score;
+mod state;
 
 pub use ages::{AGES, Age};
 pub use answer::{Answer, Labels, Question, Row, probe};
 pub use ceiling::{Held, ceiling, held};
 pub use latent::{latent_means, latent_probe, prior_probe};
 pub use score::{Features, score};
+pub use state::beside_state;
 
 use super::{dataset::Episode, ridge::Table};
 use crate::model::{
@@ -76,6 +78,10 @@ pub enum Source {
     Ceiling,
     /// The raw tokens but for their actions: an expert's action tells what the expert sees.
     CeilingWithoutActions,
+    /// The state at that moment, by ridge regression.
+    State,
+    /// Both the latent's mean and that.
+    LatentAndState,
 }
 
 /// One line of the probe's table.
