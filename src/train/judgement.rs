@@ -5,6 +5,8 @@ use crate::model::method::Looks;
 
 /// Errors of a probe above which the context counts as not found: half of its variance.
 const POOR: f64 = 0.5;
+/// Error of the state alone below which it tells a part of the context that is worth a word.
+const SHOWN: f64 = 0.6;
 /// Shares of what was surprising below which the latent explains next to nothing.
 const LITTLE: f64 = 0.05;
 /// Of what it explains in the episodes that it learned from, so much must be lost in others before it counts as known by heart.
@@ -65,9 +67,9 @@ fn by_heart(found: &Found) -> Option<f64> {
     Some(learned).filter(|_| found.beside_baseline && lost > LITTLE && lost > BY_HEART * learned)
 }
 
-/// Whether one look at the state tells a part of the context that is worth a word.
+/// Whether one look at the state tells a part of the context.
 fn told_by_state(held: &Held) -> bool {
-    held.state < POOR
+    held.state < SHOWN
 }
 
 /// What the raw tokens hold, by the steps that the encoder looks at.

@@ -15,6 +15,8 @@ REPORT = ROOT / "report/identification.json"
 AGES = [None, [0, 10], [10, 30], [30, 80], [80, None]]
 READOUT = {"standard_error", "episodes"}
 """Keys more of a row that `ada-evaluate --readout` found: the agent's own episodes have no ceiling, and an error over them."""
+STATE = {"state", "mse_with_state"}
+"""Keys more of a row of a filter: the state alone, and beside the latent. Rows from before these were measured lack them."""
 KEYS = {
     "environment",
     "seed",
@@ -33,7 +35,8 @@ KEYS = {
 
 def check(row: dict[str, Any]) -> None:
     readout = row.keys() >= READOUT
-    assert set(row) == (KEYS | READOUT if readout else KEYS)
+    beside_state = row["evidence"] == "filter" and not readout and row.keys() >= STATE
+    assert set(row) == KEYS | (READOUT if readout else set()) | (STATE if beside_state else set())
     assert isinstance(row["environment"], str) and isinstance(row["method"], str) and row["environment"] and row["method"]
     assert isinstance(row["seed"], int) and row["seed"] >= 0
     assert row["where"] in ("held_out", "own_rollouts")
@@ -41,7 +44,7 @@ def check(row: dict[str, Any]) -> None:
     assert isinstance(row["ahead"], int) and (row["ahead"] > 0) == (row["evidence"] == "prior")
     assert (row["looks"], row["block_len"]) == ("running", None) or (row["looks"] == "block" and row["block_len"] >= 0)
     assert row["age"] in ([*AGES, [50, None]] if readout else AGES)
-    for error in ("mse", "ceiling", "ceiling_without_actions"):
+    for error in ("mse", "ceiling", "ceiling_without_actions", *(STATE if beside_state else ())):
         assert row[error] is None or (isinstance(row[error], float | int) and math.isfinite(row[error]) and row[error] >= 0)
 
 
@@ -111,4 +114,5 @@ def test_the_probe_prints_these_rows(tmp_path: Any) -> None:
     assert {row["environment"] for row in rows} == {"nowhere"} and {row["where"] for row in rows} == {"own_rollouts"}
     ahead = [(row["evidence"], row["ahead"], row["block_len"]) for row in rows if row["age"] is None]
     assert ahead == [(e, 0, n) for n in (1, 2, 3) for e in ("filter", "successor")] + [("prior", 1, 3), ("prior", 2, 3)]
+    assert all((row.keys() >= STATE) == (row["evidence"] == "filter" and row["block_len"] == 3) for row in rows)
     assert printed.count("\n") == len(rows) + 2, "a row a line"
