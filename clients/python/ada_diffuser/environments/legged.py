@@ -102,7 +102,8 @@ class WalkerMassE(LeggedTask, Walker2dEnv, name="walker-mass-e", id="ada/WalkerM
 
         r = v + 1 (unless it has fallen) - .001 a.a, v in m/s                   400 steps of .008 s, fewer where it falls
 
-    No expert has been searched for yet: what the mass is worth to know has not been measured.
+    The best expert of six searches of 300 iterations earns 482 on 48 episodes with action noise: it runs with a torso of up to 1.1 times
+    the mass (1000) and falls at once with one of more than 1.4 (10). What the mass is worth to know has not been measured.
 
     Args:
         mass: least and largest factor.
