@@ -2,6 +2,9 @@
 
 use std::ops::Range;
 
+/// What has more columns than this gets linear features only.
+const QUADRATIC_COLUMNS_MAX: usize = 64;
+
 /// Row-major numbers, `width` columns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Table {
@@ -41,6 +44,18 @@ impl Table {
     pub fn columns(&self, columns: Range<usize>) -> Self {
         let rows = self.values.chunks(self.width.max(1));
         Self { width: columns.len(), values: rows.flat_map(|row| &row[columns.clone()]).copied().collect() }
+    }
+
+    /// Appends a row of these columns, and of their products unless they are too many.
+    pub fn push_quadratic(&mut self, columns: &[f64]) {
+        self.values.extend(columns);
+        self.width = columns.len();
+        if columns.len() <= QUADRATIC_COLUMNS_MAX {
+            for (i, a) in columns.iter().enumerate() {
+                self.values.extend(columns[i..].iter().map(|b| a * b));
+            }
+            self.width += columns.len() * (columns.len() + 1) / 2;
+        }
     }
 
     /// Rows of both, side by side.

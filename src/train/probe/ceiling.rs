@@ -34,8 +34,6 @@ const FIT_ROWS: usize = 12_000;
 const HELD_ROWS: (usize, usize) = (4_000, 100_000);
 /// Transitions whose features are made at once.
 const CHUNK: usize = 4096;
-/// What has more columns than this gets linear features only.
-const QUADRATIC_COLUMNS_MAX: usize = 64;
 /// Estimates that the filter over the whole past has one by one, at the least.
 const LAGS_MIN: usize = 10;
 
@@ -161,22 +159,10 @@ fn transitions(source: Source, episodes: &[Episode], places: &[Place]) -> io::Re
         let (state, action, reward, next) = (episode.state(*t)?, episode.action(*t)?, episode.reward(*t)?, episode.state(t + 1)?);
         let action: &[f32] = if source == Source::CeilingWithoutActions { &[] } else { &action };
         let parts = [&*state, action, &[reward], &*next];
-        quadratic(&parts.into_iter().flatten().map(|value| f64::from(*value)).collect::<Vec<_>>(), &mut features);
+        features.push_quadratic(&parts.into_iter().flatten().map(|value| f64::from(*value)).collect::<Vec<_>>());
         truth.values.extend(episode.context(*t)?.iter().map(|value| f64::from(*value)));
     }
     Ok((features, truth))
-}
-
-/// Appends a row of these columns, and of their products unless they are too many.
-pub(super) fn quadratic(columns: &[f64], features: &mut Table) {
-    features.values.extend(columns);
-    features.width = columns.len();
-    if columns.len() <= QUADRATIC_COLUMNS_MAX {
-        for (i, a) in columns.iter().enumerate() {
-            features.values.extend(columns[i..].iter().map(|b| a * b));
-        }
-        features.width += columns.len() * (columns.len() + 1) / 2;
-    }
 }
 
 #[cfg(test)]

@@ -3,9 +3,7 @@
 //! alone, and its own probe says little of what a decision knows.
 
 use super::{
-    Features, Place, Score, Source, Subjects,
-    ceiling::quadratic,
-    latent_means, places,
+    Features, Place, Score, Source, Subjects, latent_means, places,
     score::{self, score},
 };
 use crate::{
@@ -48,7 +46,7 @@ fn states(episodes: &[Episode], places: &[Place]) -> io::Result<Table> {
     let mut features = Table::new(0);
     for (episode, t) in places {
         let state: Vec<f64> = episodes[*episode].state(*t)?.iter().map(|value| f64::from(*value)).collect();
-        quadratic(&state, &mut features);
+        features.push_quadratic(&state);
     }
     Ok(features)
 }
