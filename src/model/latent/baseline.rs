@@ -2,7 +2,7 @@
 //! inferred from and has to explain: a context moves a state or an action by a few per cent of what everybody knows of it, which is too little to
 //! pay for its bits in the ELBO, and all there is of a surprise.
 
-use super::{Tokens, mlp::Mlp};
+use super::{Surprises, Tokens, mlp::Mlp};
 use crate::model::{
     nn::{
         Activations, Linear,
@@ -45,17 +45,6 @@ pub struct Baseline {
     surprise: [Linear; 3],
 }
 
-/// How far tokens are from what was expected of them, whitened by [`WHITENERS`].
-#[derive(Clone, Debug)]
-pub struct Surprises<V = Tensor> {
-    /// The arrival at s_t from s_{t-1} by a_{t-1}: `(B, L, state_dim)`.
-    pub state: V,
-    /// a_t in s_t: `(B, L, action_dim)`; none where nobody looks at it.
-    pub action: Option<V>,
-    /// r_t of a_t in s_t: `(B, L, 1)`.
-    pub reward: V,
-}
-
 /// Mean squared errors of one batch of transitions.
 pub struct ContextFreeTerms {
     /// What is minimised: the sum of the three.
@@ -66,17 +55,6 @@ pub struct ContextFreeTerms {
     pub action_error: Tensor,
     /// Of the reward.
     pub reward_error: Tensor,
-}
-
-impl Surprises {
-    /// The same change to each.
-    ///
-    /// # Errors
-    /// Those of `change`.
-    pub fn map(&self, change: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
-        let action = self.action.as_ref().map(&change).transpose()?;
-        Ok(Self { state: change(&self.state)?, action, reward: change(&self.reward)? })
-    }
 }
 
 impl Baseline {

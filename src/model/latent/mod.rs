@@ -8,12 +8,12 @@ mod heads;
 mod mlp;
 mod tokens;
 
-pub use baseline::{Baseline, ContextFreeTerms, Surprises, WHITENERS};
+pub use baseline::{Baseline, ContextFreeTerms, WHITENERS};
 pub use encoder::Encoder;
 pub use evidence::Evidence;
 pub use gaussian::{Gaussian, GaussianRef, hold_within};
 pub use heads::{Decoder, Prior, Told};
-pub use tokens::{Before, Tokens};
+pub use tokens::{Before, Surprises, Tokens};
 
 use crate::model::{
     method::{Future, GruLatent},

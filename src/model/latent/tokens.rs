@@ -1,6 +1,5 @@
 //! Tokens of a batch of sequences, side by side: what the encoder reads.
 
-use super::Surprises;
 use crate::model::{
     nn::Activations,
     trajectory::{Layout, TokenRef},
@@ -35,6 +34,17 @@ pub struct Before<V = Tensor> {
     pub action: V,
     /// `(B, L, 3)`: 1 where enough is known to compare the arrival at s_t, a_t, and r_t with what was to be expected, else 0.
     pub told: V,
+}
+
+/// How far tokens are from what was expected of them, whitened ([`super::WHITENERS`]).
+#[derive(Clone, Debug)]
+pub struct Surprises<V = Tensor> {
+    /// The arrival at s_t from s_{t-1} by a_{t-1}: `(B, L, state_dim)`.
+    pub state: V,
+    /// a_t in s_t: `(B, L, action_dim)`; none where nobody looks at it.
+    pub action: Option<V>,
+    /// r_t of a_t in s_t: `(B, L, 1)`.
+    pub reward: V,
 }
 
 /// What can be compared with an expectation of a token, by what is seen of the one before it and of itself (state, action, reward).
@@ -109,6 +119,17 @@ impl<V: Activations> Tokens<V> {
     pub fn batch_len(&self) -> Result<(usize, usize)> {
         let [batch, len, _] = self.state.shape()?;
         Ok((batch, len))
+    }
+}
+
+impl Surprises {
+    /// The same change to each.
+    ///
+    /// # Errors
+    /// Those of `change`.
+    pub fn map(&self, change: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
+        let action = self.action.as_ref().map(&change).transpose()?;
+        Ok(Self { state: change(&self.state)?, action, reward: change(&self.reward)? })
     }
 }
 

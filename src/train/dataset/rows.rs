@@ -353,6 +353,11 @@ impl Episode {
     }
 }
 
+/// Columns of a step's surprises: state, action, reward.
+pub(super) fn surprise_width(layout: Layout) -> usize {
+    layout.dim() + 1
+}
+
 /// One step of an episode.
 pub struct Step<'a> {
     /// s_t.

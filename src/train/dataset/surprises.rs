@@ -4,13 +4,13 @@
 use super::{
     Episode, Sides, Span,
     room::Room,
-    rows::{FieldWriter, pieces},
+    rows::{FieldWriter, pieces, surprise_width},
     window::TokenRows,
 };
 use crate::{
     model::{
         latent::{Baseline, Tokens},
-        trajectory::{Layout, Seen},
+        trajectory::Seen,
     },
     train::parallel::side_by_side,
 };
@@ -37,7 +37,7 @@ fn by_pieces(piece: usize, sides: &Sides, baseline: &Baseline, room: &Room) -> R
     let first = all().next().context("a data set without episodes: is a bug")?;
     // As if all rows were of one episode: who reads an episode's first step knows nothing of the one before it, so nobody looks at its arrival.
     let every = first.of_rows(Span { rows: 0..rows, play: false, before: None });
-    let width = width(first.layout);
+    let width = surprise_width(first.layout);
     let in_file = first.in_file() || 4 * (rows * (first.columns() + width)) as u64 > room.memory_bytes;
     let mut writer = FieldWriter::new(width, rows, room, in_file)?;
     let pieces: Vec<Range<usize>> = pieces(0..rows, piece).collect();
@@ -48,11 +48,6 @@ fn by_pieces(piece: usize, sides: &Sides, baseline: &Baseline, room: &Room) -> R
     let field = Arc::new(writer.finish()?);
     let told = |episodes: &[Episode]| episodes.iter().map(|episode| episode.telling(&field)).collect();
     Ok(Sides { train: told(&sides.train), held_out: told(&sides.held_out) })
-}
-
-/// Columns of a step's surprises: state, action, reward.
-pub(super) fn width(layout: Layout) -> usize {
-    layout.dim() + 1
 }
 
 /// Surprises of these steps, row after row.
@@ -75,6 +70,7 @@ mod tests {
             Networks,
             method::{Baseline as Width, LatentSource},
             nn::params::Params,
+            trajectory::Layout,
         },
         train::tests::recipe_with,
     };

@@ -1,6 +1,10 @@
 //! Batches: blocks for the ELBO and windows to denoise, cut from episodes at drawn places.
 
-use super::{Episode, hidden::Hide, rows::Step, surprises};
+use super::{
+    Episode,
+    hidden::Hide,
+    rows::{Step, surprise_width},
+};
 use crate::model::{
     diffusion::{
         refine::{Standing, WindowBatch},
@@ -61,7 +65,7 @@ impl TokenRows {
         self.action.extend(std::iter::repeat_n(0.0, action_dim));
         self.reward.push(0.0);
         if let Some(all) = &mut self.surprise {
-            all.extend(std::iter::repeat_n(0.0, surprises::width(self.layout)));
+            all.extend(std::iter::repeat_n(0.0, surprise_width(self.layout)));
         }
     }
 
@@ -77,7 +81,7 @@ impl TokenRows {
             let (state, action, reward) = (part(0, state_dim)?, part(state_dim, action_dim)?, part(state_dim + action_dim, 1)?);
             Ok::<_, candle_core::Error>(Surprises { state, action: Some(action), reward })
         };
-        let surprises = self.surprise.map(|all| split(tensor(all, surprises::width(self.layout))?)).transpose()?;
+        let surprises = self.surprise.map(|all| split(tensor(all, surprise_width(self.layout))?)).transpose()?;
         Ok(Tokens {
             noise: Tensor::zeros((batch, len, 1), candle_core::DType::F32, &Device::Cpu)?,
             state: tensor(self.state, state_dim)?,
