@@ -312,7 +312,14 @@ async fn one_address_does_not_take_all_places() {
     let mut newcomer = from("127.0.0.2").await;
     newcomer.write_all(b"connection: close\r\n\r\n").await.unwrap();
     assert!(answer_of(&mut newcomer).await.starts_with("HTTP/1.1 200"));
-    let mut last = held.pop().unwrap();
-    let told = reply_of(&answer_of(&mut last).await);
+    // One that is refused while it writes may be reset before it has read why.
+    let mut told = String::new();
+    for refused in &mut held[8..] {
+        told = answer_of(refused).await;
+        if !told.is_empty() {
+            break;
+        }
+    }
+    let told = reply_of(&told);
     assert_eq!((told.status, told.reason().as_str(), told.headers["retry-after"].as_bytes()), (503, "CONNECTIONS_FULL", &b"1"[..]));
 }
