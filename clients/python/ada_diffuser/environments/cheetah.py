@@ -4,102 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
-from .half_cheetah import ACTION_SIZE, OBSERVATION_SIZE, HalfCheetahBody
+from .half_cheetah import HalfCheetahBody
+from .running import RunningTask
 from .search import Search
-from .task import HiddenTask
 
 ACTION_COST = 0.05
 WIND_TARGET = 1.5
 """Wanted speed of the wind tasks, m/s."""
-RENDER_SIZE = (480, 360)
 GRID_SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5)
 """Speeds that get an expert of their own where the environment draws from a continuum."""
 
 
-class CheetahTask(HiddenTask):
-    """What the cheetah tasks share: reward `-|v - v*| - .05 a.a` unless they say another, episodes numbered within a session, rendering.
+class CheetahTask(RunningTask):
+    """What the cheetah tasks share: reward `-|v - v*| - .05 a.a` unless they say another."""
 
-    A *session* starts at the first `reset` and at each `reset(seed=...)`; its episodes are numbered 0, 1, ...
-    `reset(options={"episode": i})` jumps to episode `i`. The action is clipped to [-1, 1] before anything else.
-    """
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own spelling)
     action_noise = (0.0, 0.05, 0.1)  # more of it stops the gait
+    body: HalfCheetahBody
 
     def __init__(self, wind_on: str = "torso", render_mode: str | None = None) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be rgb_array or None, not {render_mode!r}")
-        self.body = HalfCheetahBody(wind_on)
-        self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
-        self.action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-        self.render_mode = render_mode
-        self._renderer: Any = None
-        self._episode = -1
-        self._step = 0
-
-    @property
-    def context(self) -> np.ndarray:
-        """The hidden value that acts on the coming step, shape (1,)."""
-        return np.array([self._context()], np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; see the class for `seed` and `options`."""
-        super().reset(seed=seed)
-        starts_session = seed is not None or self._episode < 0
-        self._episode = 0 if starts_session else self._episode + 1
-        self._episode = int((options or {}).get("episode", self._episode))
-        self._step = 0
-        self._draw_context(starts_session)
-        self.body.reset(self.np_random)
-        return self.body.observation(), {"context": self.context, "x_position": self.body.x}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance .05 s; see `gymnasium.Env.step`."""
-        action = np.minimum(np.maximum(np.asarray(action, np.float64), -1.0), 1.0)  # np.clip, at a third of its time
-        context = self.context
-        speed = self.body.step(action, self._wind())
-        reward = self._reward(speed, action)
-        self._step += 1
-        info = {"context": context, "x_position": self.body.x, "x_velocity": speed}
-        return self.body.observation(), reward, False, False, info
+        super().__init__(HalfCheetahBody(wind_on), render_mode)
 
     def failed(self, episode_return: float) -> bool:
         """Whether a finished episode earned little more than standing still would have."""
         return episode_return < -0.75 * self.episode_steps * self._target()
 
-    def render(self) -> np.ndarray | None:
-        """One frame (360, 480, 3) uint8 from the camera that tracks the cheetah; needs a working `MUJOCO_GL`."""
-        if self.render_mode is None:
-            return None
-        if self._renderer is None:
-            import mujoco
-
-            self._renderer = mujoco.Renderer(self.body.model, height=RENDER_SIZE[1], width=RENDER_SIZE[0])
-        self._renderer.update_scene(self.body.data, camera="track")
-        return self._renderer.render()
-
-    def close(self) -> None:
-        """Free the renderer, if one was made."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
-    def _draw_context(self, starts_session: bool) -> None:
-        raise NotImplementedError
-
-    def _context(self) -> float:
-        raise NotImplementedError
+    def _move(self, action: np.ndarray) -> float:
+        return self.body.step(action, self._wind())
 
     def _wind(self) -> float:
         return 0.0
 
     def _reward(self, speed: float, action: np.ndarray) -> float:
-        """Of the step that was just made, at `speed` m/s by the clipped `action`."""
         return -abs(speed - self._target()) - ACTION_COST * float(action @ action)
 
     def _target(self) -> float:

@@ -11,8 +11,6 @@ import numpy as np
 XML = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "half_cheetah.xml"
 FRAME_SKIP = 5
 RESET_NOISE = 0.1
-OBSERVATION_SIZE = 17
-ACTION_SIZE = 6
 TOTAL_MASS = 14.0
 WIND_ON = ("torso", "all_bodies", "rootx")
 
@@ -68,7 +66,11 @@ class HalfCheetahBody:
         else:
             self.data.qfrc_applied[self._rootx] = -force
 
-    def step(self, action: np.ndarray, wind: float) -> float:
+    def throw(self, speed: float) -> None:
+        """Give it `speed` m/s along x, whatever it had; the limbs go on moving against the torso as they did."""
+        self._velocity[self._rootx] = speed
+
+    def step(self, action: np.ndarray, wind: float = 0.0) -> float:
         """Execute `action` (6,) for .05 s against `wind` N; returns the mean forward speed in m/s."""
         before = self.x
         self._control[:] = action
