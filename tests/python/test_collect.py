@@ -83,6 +83,14 @@ def test_the_card_tells_what_the_file_is(tmp_path, capsys):
     assert card["returns"]["failures"] == 3, "an expert after one update stands still"
 
 
+@pytest.mark.parametrize("flag", ["--option", "--env-option"])
+def test_the_papers_speeds_are_collected_episode_by_episode(flag, tmp_path):
+    path = tmp_path / "x.h5"
+    assert run(path, "--env", "cheetah-vel-e", flag, "targets=lilac", "--episodes", "4", "--expert", "random") == 0
+    speeds = load_episodes(path).context.reshape(4, 200)
+    assert np.allclose(speeds, 1.5 + 1.5 * np.sin(0.5 * np.arange(4))[:, None], atol=1e-6)
+
+
 def test_the_expert_beside_the_data_is_used_again_only_for_its_own_recipe(tmp_path, capsys):
     path, cache = tmp_path / "x.h5", tmp_path / "x.expert.npz"
     run(path, "--env", "cheetah-wind-s")

@@ -65,6 +65,24 @@ def test_somebody_elses_environment_is_driven_and_judged(here: Path, address: st
     assert "| their_module:Theirs-v0 | tiny | false |" in capsys.readouterr().out
 
 
+def test_a_rollout_has_the_environments_options(
+    here: Path, address: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`ada-evaluate` alone took them, so that no film could be made of the speeds that it was asked about."""
+    words = ["--env", "point-wind-s", "--url", address, "--model", "tiny", "--episodes", "1", "--episode-steps", "6"]
+    told, filmed = [], []
+    monkeypatch.setattr(film, "save_film", lambda env, episode, readout, path, env_options: filmed.append(env_options))
+    for options in ([], ["--env-option", "sigma=0.5"]):
+        assert rollout.main([*words, *options, "--json", "a.json", "--film", "a.gif"]) == 0
+        told.append(json.loads(Path("a.json").read_text()))
+    plain, noisy = told
+    assert noisy["env_options"] == {"sigma": 0.5} and "env_options" not in plain
+    assert noisy["returns"] != plain["returns"] and filmed == [{}, {"sigma": 0.5}]
+    capsys.readouterr()
+    assert rollout.main([*words, "--env-option", "sigmas=1"]) == 1
+    assert "sigmas" in capsys.readouterr().err
+
+
 def test_a_picture_that_fails_loses_nothing(
     here: Path, address: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,7 +92,7 @@ def test_a_picture_that_fails_loses_nothing(
         raise RuntimeError("the font is gone")
 
     monkeypatch.setattr(plot, "save_plot", broken)
-    monkeypatch.setattr(film, "save_film", lambda env, episode, readout, path: path.write_text("film") and None)
+    monkeypatch.setattr(film, "save_film", lambda env, episode, readout, path, env_options: path.write_text("film") and None)
     words = quick(address, "--model", "tiny", "--json", "out/a.json", "--plot", "out/a.png", "--film", "out/a.gif")
     assert rollout.main(words) == 1
     told = capsys.readouterr()

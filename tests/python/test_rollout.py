@@ -143,9 +143,19 @@ def test_the_point_film_has_a_frame_a_step(tmp_path: Path) -> None:
         assert film.n_frames == 20 and film.info["loop"] == 0
 
 
-def test_the_cheetah_film_is_made_or_its_absence_explained(tmp_path: Path) -> None:
+def test_a_film_shows_the_environment_with_its_options(tmp_path: Path) -> None:
+    episode = played("point-wind-s", 1)
+    for name, options in (("plain", None), ("same", {"omega": 0.2}), ("other", {"omega": 2.0})):
+        assert save_film("point-wind-s", episode, "none", tmp_path / name, options) is None
+    plain, same, other = ((tmp_path / name).read_bytes() for name in ("plain", "same", "other"))
+    assert plain == same != other
+    assert "omegas" in str(save_film("point-wind-s", episode, "none", tmp_path / "none", {"omegas": 1}))
+
+
+@pytest.mark.parametrize("env", ["cheetah-wind-s"])
+def test_the_film_of_a_body_is_made_or_its_absence_explained(tmp_path: Path, env: str) -> None:
     path = tmp_path / "film.gif"
-    reason = save_film("cheetah-wind-s", played("cheetah-wind-s", 3), "none", path)
+    reason = save_film(env, played(env, 3), "none", path)
     if reason is None:
         with Image.open(path) as film:
             assert film.n_frames == 20

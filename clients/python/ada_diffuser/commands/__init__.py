@@ -18,10 +18,13 @@ _ENV_HELP = "short name, as point-wind-s (a wrong one lists them all), Gymnasium
 
 
 def add_environment_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which environment, and how long its episodes are."""
+    """Which environment, its options, and how long its episodes are."""
     parser.add_argument("--env", required=True, metavar="NAME", help=_ENV_HELP)
     parser.add_argument(
         "--episode-steps", type=int, metavar="N", help="truncate episodes there (default: as the environment is registered)"
+    )
+    parser.add_argument(
+        "--env-option", action="append", default=[], metavar="NAME=VALUE", help="option of the environment, value as JSON; repeatable"
     )
 
 
@@ -110,8 +113,9 @@ def import_environments() -> ModuleType:
     return environments
 
 
-def check_environment(arguments: argparse.Namespace, **options: Any) -> None:
-    """Raises `ValueError` for an environment that cannot be made with these options, before a server is waited for."""
+def check_environment(arguments: argparse.Namespace) -> None:
+    """Raises `ValueError` for an environment that cannot be made with its options, before a server is waited for."""
+    options = environment_options(arguments.env_option)
     import_environments().make(arguments.env, episode_steps=arguments.episode_steps, **options).close()
 
 

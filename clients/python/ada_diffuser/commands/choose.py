@@ -64,7 +64,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--write {out} is a file, and a directory is to be written")
     if out and out.resolve() == checkpoint.resolve() and (out / "training").exists():
         raise ValueError(f"--write {out}: the next `run` would write the recipe's defaults again; name another directory")
-    check_environment(arguments, **environment_options(arguments.env_option))
+    check_environment(arguments)
 
 
 def _restart(setting: Setting, facts: Facts) -> tuple[str, ...]:

@@ -95,9 +95,7 @@ def _parser() -> argparse.ArgumentParser:
         "--session-episodes", type=int, metavar="N", help="another session begins every N episodes, and infos/session numbers them"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random here (default 0)")
-    parser.add_argument(
-        "--option", action="append", default=[], metavar="NAME=VALUE", help="option of the environment, value as JSON; repeatable"
-    )
+    parser.add_argument("--option", action="append", dest="env_option", metavar="NAME=VALUE", help="another word for --env-option")
     parser.add_argument(
         "--action-noise",
         metavar="A,B,..",
@@ -152,7 +150,7 @@ def _plan(args: argparse.Namespace) -> Job:
     environments = import_environments()
     from ada_diffuser.collect import Job
 
-    options = environment_options(args.option)
+    options = environment_options(args.env_option)
     env = environments.make(args.env, episode_steps=args.episode_steps, **options)
     noise = _noise(args.action_noise) if args.action_noise else environments.action_noise(env)
     env_id = args.env if ":" in args.env else env.spec.id

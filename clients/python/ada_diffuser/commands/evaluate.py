@@ -77,9 +77,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("ada-evaluate", description=_ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_environment_arguments(parser)
-    parser.add_argument(
-        "--env-option", action="append", default=[], metavar="NAME=VALUE", help="option of the environment, value as JSON; repeatable"
-    )
     add_server_arguments(parser)
     add_trial_arguments(parser)
     parser.add_argument("--models", default="", help="names, with commas between (default: the server's default model)")
@@ -139,8 +136,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     models = [model.strip() for model in arguments.models.split(",")]
     if len(models) > 1 and not all(models):
         raise ValueError(f"--models {arguments.models!r} has an empty name")
-    env_options = environment_options(arguments.env_option)
-    check_environment(arguments, **env_options)
+    check_environment(arguments)
     from ada_diffuser.rollout import Trial
 
     trials = [
@@ -155,7 +151,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
             withhold_rewards=arguments.withhold_rewards,
             session_episodes=arguments.session_episodes,
             forget=arguments.forget,
-            env_options=env_options,
+            env_options=environment_options(arguments.env_option),
         )
         for model in models
         for options in settings

@@ -14,6 +14,7 @@ from ada_diffuser.commands import (
     add_server_arguments,
     add_trial_arguments,
     check_environment,
+    environment_options,
     parse_settings,
     run_command,
     server_url,
@@ -75,6 +76,7 @@ def _run(arguments: argparse.Namespace) -> None:
         options,
         arguments.episode_steps,
         withhold_rewards=arguments.withhold_rewards,
+        env_options=environment_options(arguments.env_option),
     )
     with Client(server_url(arguments.url, arguments.face)) as client:
         client.wait_ready(arguments.wait)
@@ -93,7 +95,7 @@ def _write_all(arguments: argparse.Namespace, result: Evaluation, readout: Reado
     from ada_diffuser.rollout.plot import save_plot
 
     def save_film_or_say_why(path: Path) -> None:
-        reason = save_film(result.trial.env, result.episodes[-1], readout, path)
+        reason = save_film(result.trial.env, result.episodes[-1], readout, path, result.trial.env_options)
         print(f"film: {path}" if reason is None else f"film: skipped, no way to render here ({reason})")
 
     def save_plot_and_say_so(path: Path) -> None:

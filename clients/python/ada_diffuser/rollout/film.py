@@ -6,12 +6,14 @@ may have EGL, OSMesa or neither: `python -m ada_diffuser.rollout.film EPISODE.np
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +29,15 @@ WIDTH = 360
 FRAME_MS = 50
 
 
-def save_film(env: str, episode: Episode, readout: Readout | str, path: Path) -> str | None:
-    """Writes the film; None, or why there is none."""
+def save_film(env: str, episode: Episode, readout: Readout | str, path: Path, env_options: Mapping[str, Any] | None = None) -> str | None:
+    """Writes the film; None, or why there is none. `env_options` are those of the environment that the episode was played in."""
     with tempfile.TemporaryDirectory() as folder:
         recorded = Path(folder) / "episode.npz"
         seen = readout.of(episode) if isinstance(readout, Readout) else np.zeros((0, 0))
         np.savez(
             recorded,
             env=env,
+            env_options=json.dumps(dict(env_options or {})),
             seed=episode.seed,
             actions=np.array(episode.actions),
             rewards=np.array(episode.rewards),
@@ -70,7 +73,8 @@ def _render_apart(recorded: Path, path: Path, backend: str) -> str | None:
 
 
 def _frames(record: dict[str, NDArray[np.float32]]) -> Iterator[Image.Image]:
-    env = environments.make(str(record["env"]), episode_steps=len(record["actions"]), render_mode="rgb_array")
+    options = json.loads(str(record["env_options"]))
+    env = environments.make(str(record["env"]), episode_steps=len(record["actions"]), **{**options, "render_mode": "rgb_array"})
     if "rgb_array" not in env.metadata.get("render_modes", ()):
         raise ValueError(f"{record['env']} cannot draw itself: rgb_array is none of its render modes")
     env.reset(seed=int(record["seed"]))
