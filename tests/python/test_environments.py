@@ -23,6 +23,8 @@ from ada_diffuser.environments.half_cheetah import XML, HalfCheetahBody
 CHEETAHS = [name for name in environments.NAMES if name.startswith("cheetah-wind") or name == "cheetah-vel-e"]
 FALLS = ("hopper-gravity-e", "walker-mass-e")
 """Environments whose episodes a fall ends."""
+EARNED = dict.fromkeys(FALLS, 900.0) | {"cheetah-dir-e": 200.0, "ant-dir-e": 100.0}
+"""What an expert may earn, where that is not below 0."""
 
 
 @pytest.mark.parametrize("name", environments.NAMES)
@@ -391,4 +393,4 @@ def test_a_return_of_standing_still_counts_as_failed_and_an_experts_does_not(nam
     env.reset(seed=0)
     still = sum(env.step(np.zeros(env.action_space.shape, np.float32))[1] for _ in range(200))
     assert env.failed(still)
-    assert not env.failed(900.0 if name in FALLS else -50.0)
+    assert not env.failed(EARNED.get(name, -50.0))

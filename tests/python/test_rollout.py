@@ -152,7 +152,7 @@ def test_a_film_shows_the_environment_with_its_options(tmp_path: Path) -> None:
     assert "omegas" in str(save_film("point-wind-s", episode, "none", tmp_path / "none", {"omegas": 1}))
 
 
-@pytest.mark.parametrize("env", ["cheetah-wind-s"])
+@pytest.mark.parametrize("env", ["cheetah-wind-s", "cheetah-dir-e", "ant-dir-e"])
 def test_the_film_of_a_body_is_made_or_its_absence_explained(tmp_path: Path, env: str) -> None:
     path = tmp_path / "film.gif"
     reason = save_film(env, played(env, 3), "none", path)

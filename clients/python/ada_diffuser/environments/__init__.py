@@ -3,8 +3,9 @@
     import gymnasium
     env = gymnasium.make("ada_diffuser.environments:ada/PointWind-S-v0")
 
-`-S` contexts change within an episode, `-E` contexts between episodes. The context is in `info["context"]` alone:
-the array returned by step `t` acted while `a_t` was executed, the one returned by `reset` acts on the first step.
+`-S` contexts change within an episode, `-E` contexts between episodes, but for those of the paper's Dir-E, which change within. The
+context is in `info["context"]` alone: the array returned by step `t` acted while `a_t` was executed, the one returned by `reset` acts on
+the first step.
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ from .pendulum_torque import PendulumTorqueS
 from .point_wind import PointWindS
 from .search import ArsSettings, Search
 from .task import NAMES, HiddenTask
+from .turning import AntDirE, CheetahDirE
 
 __all__ = [
     "NAMES",
+    "AntDirE",
     "ArsSettings",
     "CheetahCumulativeS",
     "CheetahDelayedS",
+    "CheetahDirE",
     "CheetahGaleS",
     "CheetahVelE",
     "CheetahWindE",
