@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +35,20 @@ def running(log: Path, *flags: str, kill: bool = False) -> Iterator[str]:
     finally:
         server.kill()
         server.wait()
+
+
+def gone(pid: int, within_s: float = 10.0) -> None:
+    """Fails if the process is still there after a while; a dead one that nobody has waited for is none."""
+    end = time.monotonic() + within_s
+    while time.monotonic() < end:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return
+        if state == "Z":
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"process {pid} is still there")
 
 
 def _is_ready(client: Client) -> bool:
