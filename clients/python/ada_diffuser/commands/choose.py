@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from ada_diffuser.client import Client
 from ada_diffuser.commands import check_environment, environment_options, parse_settings
 from ada_diffuser.commands.outputs import check_output, save_json
-from ada_diffuser.commands.progress import progress
 from ada_diffuser.commands.programs import Programs, defaults_line
+from ada_diffuser.commands.progress import progress
 from ada_diffuser.commands.variants import served
 
 if TYPE_CHECKING:

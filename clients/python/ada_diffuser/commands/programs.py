@@ -72,11 +72,11 @@ def _find(name: str, folder: Path | None) -> str:
 def _output(command: Sequence[str]) -> str:
     done = subprocess.run(leashed(command), capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise ValueError(f"{Path(command[0]).name} {command[1]}: {last_line(done.stderr) or f'ended with {done.returncode}'}")
+        raise ValueError(f"{Path(command[0]).name} {command[1]}: {_last_line(done.stderr) or f'ended with {done.returncode}'}")
     return done.stdout
 
 
-def last_line(text: str) -> str:
+def _last_line(text: str) -> str:
     return (text.strip().splitlines() or [""])[-1].strip()
 
 
@@ -121,7 +121,7 @@ def _wait_ready(server: subprocess.Popen[bytes], address: str, log: Path) -> Non
             except Unavailable:
                 if server.poll() is not None:
                     break
-    raise ValueError(f"ada-server does not get ready: {last_line(log.read_text(errors='replace'))}")
+    raise ValueError(f"ada-server does not get ready: {_last_line(log.read_text(errors='replace'))}")
 
 
 @contextmanager
