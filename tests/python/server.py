@@ -51,6 +51,21 @@ def gone(pid: int, within_s: float = 10.0) -> None:
     raise AssertionError(f"process {pid} is still there")
 
 
+def descendants(pid: int) -> list[int]:
+    """Processes: children, their children and so on."""
+    parents: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    found, new = list[int](), [pid]
+    while new:
+        new = [child for one in new for child in parents.get(one, [])]
+        found += new
+    return found
+
+
 def _is_ready(client: Client) -> bool:
     try:
         client.wait_ready(1)

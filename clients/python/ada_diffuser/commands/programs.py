@@ -17,6 +17,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from ada_diffuser import leash
 from ada_diffuser.client import Client
 from ada_diffuser.errors import Unavailable
 
@@ -82,7 +83,7 @@ def _last_line(text: str) -> str:
 
 def leashed(command: Sequence[str]) -> list[str]:
     """The command, to be started from this process alone: it ends with it, kill -9 or not."""
-    return [sys.executable, "-I", "-S", str(Path(__file__).with_name("leash.py")), str(os.getpid()), *command]
+    return [sys.executable, "-I", "-S", leash.__file__, str(os.getpid()), *command]
 
 
 @contextmanager
