@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +35,35 @@ def running(log: Path, *flags: str, kill: bool = False) -> Iterator[str]:
     finally:
         server.kill()
         server.wait()
+
+
+def gone(pid: int, within_s: float = 10.0) -> None:
+    """Fails if the process is still there after a while; a dead one that nobody has waited for is none."""
+    end = time.monotonic() + within_s
+    while time.monotonic() < end:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return
+        if state == "Z":
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"process {pid} is still there")
+
+
+def descendants(pid: int) -> list[int]:
+    """Processes: children, their children and so on."""
+    parents: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    found, new = list[int](), [pid]
+    while new:
+        new = [child for one in new for child in parents.get(one, [])]
+        found += new
+    return found
 
 
 def _is_ready(client: Client) -> bool:

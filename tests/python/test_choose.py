@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from server import BINARY, ROOT
+from server import BINARY, ROOT, gone
 
 from ada_diffuser import Client, SamplerOptions
 from ada_diffuser.commands import evaluate as evaluate_command
@@ -236,8 +237,9 @@ def test_settings_are_checked_before_the_first_episode(tmp_path: Path, capsys: p
         assert names in told.err and told.err.count("\n") == 1 and told.out == "", told
 
 
-def test_no_server_is_left_when_the_command_is_ended(tmp_path: Path) -> None:
-    """It runs in a session of its own, so that nobody else would end it."""
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_no_server_is_left_when_the_command_is_ended(tmp_path: Path, number: signal.Signals) -> None:
+    """It runs in a session of its own, so that nobody else would end it; nor could a command that was killed."""
     programs, temporary, pid = tmp_path / "programs", tmp_path / "temporary", tmp_path / "pid"
     programs.mkdir()
     temporary.mkdir()
@@ -249,8 +251,7 @@ def test_no_server_is_left_when_the_command_is_ended(tmp_path: Path) -> None:
         assert running.stderr is not None
         assert running.stderr.readline().startswith("episodes 0 to 124"), "it plays"
         os.kill(int(pid.read_text()), 0)
-        running.terminate()
-        assert running.wait(60) == 143
-    with pytest.raises(ProcessLookupError):
-        os.kill(int(pid.read_text()), 0)
-    assert not list(temporary.iterdir())
+        running.send_signal(number)
+        assert running.wait(60) == (143 if number == signal.SIGTERM else -signal.SIGKILL)
+    gone(int(pid.read_text()))
+    assert number == signal.SIGKILL or not list(temporary.iterdir())

@@ -6,10 +6,13 @@ import hashlib
 import json
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from server import descendants, gone
 
 from ada_diffuser import environments
 from ada_diffuser.collect import Job, collect
@@ -305,3 +308,17 @@ def test_an_expert_of_another_shape_is_refused(tmp_path, capsys):
     expert = tmp_path / "x.expert.npz"
     assert run(tmp_path / "y.h5", "--env", "point-wind-s", "--expert", str(expert)) == 2
     assert "expert" in capsys.readouterr().err
+
+
+def test_a_search_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
+    """Two searched on for minutes for nobody, and then waited for ever."""
+    words = ["--env", "cheetah-wind-s", "--quiet", "--out", str(tmp_path / "a.h5")]
+    with subprocess.Popen([sys.executable, "-m", "ada_diffuser.commands.collect", *words]) as running:
+        end = time.monotonic() + 60
+        while len(started := descendants(running.pid)) < 3:  # two that search, and one of Python's own
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        time.sleep(2)  # they have imported what they need
+        running.kill()
+    for pid in started:
+        gone(pid)

@@ -36,10 +36,15 @@ SHORT_FLAGS = {
     "ada-collect": "--episodes 4 --expert-searches 1 --expert-iterations 1",
     "ada-rollout": "--episodes 2 --episode-steps 12",
     "ada-evaluate": "--episodes 2 --episode-steps 12",
+    "ada-suite": "",
 }
 """Added to every call of a command; the last word on a flag counts."""
 
-PLACE_FLAGS = {"ada-rollout": "--url 127.0.0.1:7777", "ada-evaluate": f"--url 127.0.0.1:7777 --programs {BINARY.parent}"}
+PLACE_FLAGS = {
+    "ada-rollout": "--url 127.0.0.1:7777",
+    "ada-evaluate": f"--url 127.0.0.1:7777 --programs {BINARY.parent}",
+    "ada-suite": f"$([ $1 != run ] || echo --programs {BINARY.parent})",
+}
 """Where the server is; and the programs themselves, for a command that starts a server of its own beside the reader's."""
 
 IN_FULL = ("docs/simulator.md",)
@@ -116,8 +121,9 @@ class Checkout:
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = str(free.getsockname()[1])
         for path in ROOT.iterdir():
-            if path.name not in ("target", "models", "data", "runs", "out", "shipped") and not path.name.startswith("."):
+            if path.name not in ("target", "models", "report", "data", "runs", "out", "shipped") and not path.name.startswith("."):
                 (folder / path.name).symlink_to(path)
+        shutil.copytree(ROOT / "report", folder / "report")
         self._models()
         self._commands(shortened)
         self.path = f"{folder / '.venv/bin'}:{folder / 'target/release'}:{os.environ['PATH']}"

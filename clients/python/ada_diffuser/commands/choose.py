@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 from ada_diffuser.client import Client
 from ada_diffuser.commands import check_environment, environment_options, parse_settings
 from ada_diffuser.commands.outputs import check_output, save_json
+from ada_diffuser.commands.programs import Programs, defaults_line
 from ada_diffuser.commands.progress import progress
-from ada_diffuser.commands.variants import Programs, defaults_line, served
+from ada_diffuser.commands.variants import served
 
 if TYPE_CHECKING:
     from ada_diffuser.rollout import Evaluation

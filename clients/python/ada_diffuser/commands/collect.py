@@ -8,7 +8,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ada_diffuser.commands import add_environment_arguments, environment_options, import_environments, run_command
 from ada_diffuser.commands.outputs import check_output
@@ -64,6 +64,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     command = shlex.join(["ada-collect", *(sys.argv[1:] if argv is None else argv)])
     return run_command("ada-collect", lambda: _run(args, command), status=2)
+
+
+def check_words(words: Sequence[str], where: str) -> None:
+    """Raises `ValueError` that begins with `where` if a call with these words, and an environment, could not be read."""
+    parser = _parser()
+
+    def refuse(message: str) -> NoReturn:
+        raise ValueError(f"{where}: ada-collect: {message}")
+
+    parser.error = refuse  # type: ignore[method-assign]
+    parser.parse_args(["--env", "any", "--out", "any.h5", *words])
 
 
 def _run(args: argparse.Namespace, command: str) -> None:

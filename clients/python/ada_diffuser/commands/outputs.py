@@ -28,8 +28,12 @@ def check_output(flag: str, path: Path | None, *suffixes: str) -> None:
 
 
 def save_json(value: Any, path: Path) -> None:
+    """As `save_text` does."""
+    save_text(json.dumps(value, indent=1) + "\n", path)
+
+
+def save_text(text: str, path: Path) -> None:
     """Write beside and rename, so that a reader, or a crash, never meets half a file."""
-    text = json.dumps(value, indent=1) + "\n"
     if _is_device(path):
         path.write_text(text, encoding="utf-8")
         return

@@ -44,11 +44,12 @@ class _Lines:
         self.told = now
         rate = self.made / (now - self.started)
         share = f"{self.made} of {self.total} {self.unit}s ({100 * self.made // self.total} %)"
-        left = _clock((self.total - self.made) / rate)
+        left = clock((self.total - self.made) / rate)
         print(f"{self.title}: {share}, {rate:.3g} a second, {left} left", file=sys.stderr, flush=True)
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """1:02:03, or 2:03 below an hour."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

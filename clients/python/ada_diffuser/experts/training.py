@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import environments
 from ..environments import ArsSettings, Search
+from ..leash import end_with
 from .ars import search
 from .policy import CalledExpert, LinearPolicy, PolicyBank
 
@@ -149,6 +150,9 @@ _iterations_done: Any = None
 def _start_worker(done: Any) -> None:
     global _iterations_done
     _iterations_done = done
+    parent = multiprocessing.parent_process()
+    if parent and parent.pid:
+        end_with(parent.pid)
     # An interrupt at the terminal reaches workers too: end at once and in silence, the parent says what there is to say.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 

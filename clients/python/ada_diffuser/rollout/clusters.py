@@ -52,8 +52,8 @@ class Clusters:
 
 def cluster(latents: Points, contexts: Points, groups: int = GROUPS) -> Clusters:
     """Groups `(acts, latent_dim)` and `(acts, context_dim)`; a context of several values is binned along the axis of most variance."""
-    bins = _bins(_on_axes(contexts)[0][:, 0], groups)
-    plane, shares = _on_axes(latents)
+    bins = _bins(on_axes(contexts)[0][:, 0], groups)
+    plane, shares = on_axes(latents)
     return Clusters(plane, shares, bins, kmeans(latents, int(bins.max()) + 1))
 
 
@@ -101,7 +101,7 @@ def _squared_distances(points: Points, centres: Points) -> Points:
     return np.stack([((points - centre) ** 2).sum(axis=1) for centre in centres], axis=1)
 
 
-def _on_axes(points: Points) -> tuple[Points, tuple[float, float]]:
+def on_axes(points: Points) -> tuple[Points, tuple[float, float]]:
     """On the two principal axes, each pointing where its largest part is positive, and their shares of the variance."""
     centred = points - points.mean(axis=0)
     _, sizes, axes = np.linalg.svd(centred, full_matrices=False)

@@ -76,6 +76,8 @@ class _Lane:
         self.broker.accept(chunk)
         self.episode.act_steps.append(len(self.episode.rewards))
         self.episode.latents.append(chunk.latent_mean)
+        if chunk.planned_states is not None:
+            self.episode.plans.append(chunk.planned_states)
 
     def step(self) -> None:
         """Executes the next action of the chunk and reports what came of it."""
@@ -137,21 +139,21 @@ def _run(client: Client, trial: Trial, lanes: list[_Lane], acts: ActLog, progres
     while running := [lane for lane in lanes if not lane.done]:
         due = [lane for lane in running if lane.broker.due]
         if due:
-            _act(client, due, acts, batched=trial.vector > 1)
+            _act(client, trial, due, acts)
         for lane in running:
             lane.step()
         progress(len(running))
 
 
-def _act(client: Client, due: list[_Lane], acts: ActLog, *, batched: bool) -> None:
+def _act(client: Client, trial: Trial, due: list[_Lane], acts: ActLog) -> None:
     asked = [(lane.broker.session, lane.broker.observation(lane.state)) for lane in due]
     started = time.perf_counter()
-    if batched:
-        answers = client.act_batch(asked)
+    if trial.vector > 1:
+        answers = client.act_batch(asked, planned_states=trial.planned_states)
     else:
         answers = [
-            session.act(observation.state, observation.executed, nothing_executed=observation.nothing_executed)
-            for session, observation in asked
+            session.act(seen.state, seen.executed, nothing_executed=seen.nothing_executed, planned_states=trial.planned_states)
+            for session, seen in asked
         ]
     elapsed_s = time.perf_counter() - started
     chunks = []

@@ -21,8 +21,7 @@ LATENTS_SHOWN = 2000
 
 def save_plot(result: Evaluation, readout: Readout | str, path: Path) -> None:
     """Writes the picture in the format that the suffix names (png, pdf, svg)."""
-    pyplot = _pyplot()
-    figure, (rewards, returns, context) = pyplot.subplots(3, 1, figsize=(9, 9), height_ratios=(2, 2, 3), layout="constrained")
+    figure, (rewards, returns, context) = pyplot().subplots(3, 1, figsize=(9, 9), height_ratios=(2, 2, 3), layout="constrained")
     figure.suptitle(
         f"{result.model.name} on {result.trial.env}: "
         f"return {result.mean_return:.1f} ± {result.standard_error:.1f} over {len(result.episodes)} episodes"
@@ -30,7 +29,7 @@ def save_plot(result: Evaluation, readout: Readout | str, path: Path) -> None:
     _draw_rewards(rewards, result)
     _draw_returns(returns, result)
     _draw_context(context, result, readout)
-    _save(figure, path)
+    save(figure, path)
 
 
 def save_latents(readings: Sequence[Reading], path: Path) -> None:
@@ -38,14 +37,14 @@ def save_latents(readings: Sequence[Reading], path: Path) -> None:
     shown = [(one, one.clusters) for one in readings if one.clusters]
     if not shown:
         raise ValueError(f"there are no latents to draw: {readings[0].readout}")
-    figure, axes = _pyplot().subplots(len(shown), 2, figsize=(10, 4.5 * len(shown)), squeeze=False, layout="constrained")
+    figure, axes = pyplot().subplots(len(shown), 2, figsize=(10, 4.5 * len(shown)), squeeze=False, layout="constrained")
     for (left, right), (one, clusters) in zip(axes, shown, strict=True):
         _draw_plane(left, clusters, clusters.bins, "bin of the true context, low to high")
         options = " ".join(f"{name}={value}" for name, value in one.result.trial.options.given().items())
         left.set_title(f"{one.result.model.name} on {one.result.trial.env} {options}", fontsize=10)
         _draw_plane(right, clusters, clusters.groups, "group by k-means")
         right.set_title(f"adjusted Rand index {clusters.adjusted_rand_index:.2f}, purity {clusters.purity:.2f}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _draw_plane(axes: Any, clusters: Clusters, labels: np.ndarray[Any, Any], title: str) -> None:
@@ -57,7 +56,8 @@ def _draw_plane(axes: Any, clusters: Clusters, labels: np.ndarray[Any, Any], tit
     axes.legend(title=title, title_fontsize=8, ncols=5, fontsize=8, markerscale=3, loc="best")
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """matplotlib's, without a screen."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -66,9 +66,10 @@ def _pyplot() -> Any:
     return pyplot
 
 
-def _save(figure: Any, path: Path) -> None:
+def save(figure: Any, path: Path) -> None:
+    """Writes and closes a figure; the same figure gives the same bytes."""
     figure.savefig(path, dpi=120, metadata={"Software": None} if path.suffix == ".png" else None)
-    _pyplot().close(figure)
+    pyplot().close(figure)
 
 
 def _draw_rewards(axes: Any, result: Evaluation) -> None:

@@ -58,7 +58,7 @@ class Readout:
 
     def of(self, episode: Episode) -> NDArray[np.float64]:
         """The context as the latent has it, at each act of an episode, `(acts, context_dim)`."""
-        latents, _ = _pairs([episode])
+        latents, _ = pairs([episode])
         return _with_one(latents) @ self.weights
 
     def by_age(self, ages: Sequence[tuple[int, int | None]] = AGES, place: Place = "all") -> list[AgeError]:
@@ -78,11 +78,11 @@ class Readout:
     @cached_property
     def _errors(self) -> list[list[tuple[Episode, NDArray[np.float64]]]]:
         """Of each shown session: its episodes, and the standardised squared error at each of their acts."""
-        variance = _pairs(self.shown)[1].var(axis=0)
+        variance = pairs(self.shown)[1].var(axis=0)
         varies = variance > VARIANCE_MIN
 
         def errors(one: Episode) -> NDArray[np.float64]:
-            squared: NDArray[np.float64] = ((_pairs([one])[1] - self.of(one)) ** 2)[:, varies] / variance[varies]
+            squared: NDArray[np.float64] = ((pairs([one])[1] - self.of(one)) ** 2)[:, varies] / variance[varies]
             return squared.mean(axis=1)
 
         return [[(one, errors(one)) for one in session] for session in by_session(self.shown)]
@@ -101,10 +101,10 @@ def fit(episodes: Sequence[Episode]) -> Readout | str:
         return "this environment does not tell its context"
     first_shown = sum(map(len, fitted))
     shown = list(episodes[first_shown:])
-    if not np.any(_pairs(shown)[1].var(axis=0) > VARIANCE_MIN):
+    if not np.any(pairs(shown)[1].var(axis=0) > VARIANCE_MIN):
         return "the context was the same in all shown episodes: there is nothing to tell apart (try more episodes)"
     penalty = min(PENALTIES, key=lambda penalty: _left_out_error(fitted, penalty))
-    return Readout(_ridge(*_pairs(episodes[:first_shown]), penalty), first_shown, shown)
+    return Readout(_ridge(*pairs(episodes[:first_shown]), penalty), first_shown, shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,7 @@ class Reading:
 def read(result: Evaluation) -> Reading:
     """Fits and groups."""
     readout = fit(result.episodes)
-    return Reading(result, readout, None if isinstance(readout, str) else cluster(*_pairs(result.episodes)))
+    return Reading(result, readout, None if isinstance(readout, str) else cluster(*pairs(result.episodes)))
 
 
 def _aged(episode: Episode, errors: NDArray[np.float64], age: tuple[int, int]) -> NDArray[np.float64]:
@@ -182,8 +182,8 @@ def _left_out_error(sessions: Sequence[list[Episode]], penalty: float) -> float:
     error = 0.0
     for index in range(len(sessions) if len(sessions) > 1 else 0):
         others = [episode for session in [*sessions[:index], *sessions[index + 1 :]] for episode in session]
-        latents, contexts = _pairs(sessions[index])
-        error += float(np.sum((contexts - _with_one(latents) @ _ridge(*_pairs(others), penalty)) ** 2))
+        latents, contexts = pairs(sessions[index])
+        error += float(np.sum((contexts - _with_one(latents) @ _ridge(*pairs(others), penalty)) ** 2))
     return error
 
 
@@ -201,7 +201,7 @@ def _with_one(latents: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.hstack([latents, np.ones((len(latents), 1))])
 
 
-def _pairs(episodes: Sequence[Episode]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def pairs(episodes: Sequence[Episode]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Latent of each act, and the context that acted on that very step."""
     latents = [latent for episode in episodes for latent in episode.latents]
     contexts = [episode.contexts[step] for episode in episodes for step in episode.act_steps]

@@ -56,7 +56,7 @@ def markdown(results: Sequence[Evaluation], settings: Sequence[str]) -> str:
     rows = [_trial_cells(result, settings) for result in results] + [_group_cells(group, settings) for group in groups]
     if not groups:
         _drop(error, heads, rows)
-    return _rows(heads, rows)
+    return rows_of(heads, rows)
 
 
 def _trial_cells(result: Evaluation, settings: Sequence[str]) -> list[str]:
@@ -94,7 +94,7 @@ def session_table(results: Sequence[Evaluation], settings: Sequence[str]) -> str
     """One row a trial in sessions: what the episodes earn by their place in the session; the errors are over sessions."""
     indices = range(max(len(result.by_index) for result in results))
     heads = ["environment", "model", *settings, "history", "sessions", *(f"episode {index}" for index in indices)]
-    return _rows(heads, [_session_cells(result, settings, indices) for result in results])
+    return rows_of(heads, [_session_cells(result, settings, indices) for result in results])
 
 
 def _session_cells(result: Evaluation, settings: Sequence[str], indices: Sequence[int]) -> list[str]:
@@ -113,7 +113,7 @@ def choice_table(choice: Choice) -> str:
     """One row a setting, in Markdown: what it earned, and how far that is below the best cold one's, episode by episode."""
     names = list(dict.fromkeys(name for one in choice.tried for name in one.setting.values()))
     heads = [*names, "episodes", "return", "median", "failures", "evaluations/act", "below cold's best", "verdict"]
-    return _rows(heads, [_tried_cells(one, choice, names) for one in choice.tried])
+    return rows_of(heads, [_tried_cells(one, choice, names) for one in choice.tried])
 
 
 def _tried_cells(one: Tried, choice: Choice, names: Sequence[str]) -> list[str]:
@@ -142,7 +142,7 @@ def readout_table(readings: Sequence[Reading], settings: Sequence[str]) -> str:
     rows = [_reading_cells(one, place, settings, ages) for one, place in placed]
     if all(place == "all" for _, place in placed):
         _drop("episodes", heads, rows)
-    return _rows(heads, rows)
+    return rows_of(heads, rows)
 
 
 def _reading_cells(one: Reading, place: Place, settings: Sequence[str], ages: Sequence[tuple[int, int]]) -> list[str]:
@@ -165,7 +165,8 @@ def _drop(head: str, heads: list[str], rows: Sequence[list[str]]) -> None:
         del row[at]
 
 
-def _rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def rows_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
     return "\n".join(["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads), *("| " + " | ".join(row) + " |" for row in rows)])
 
 

@@ -38,6 +38,8 @@ class Trial:
     forget: bool = False
     #: Keyword arguments of the environment.
     env_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    #: Whether each act tells the states that it plans.
+    planned_states: bool = False
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.vector < 1 or self.session_episodes < 1 or self.seed < 0:
@@ -68,6 +70,8 @@ class Episode:
     #: Environment steps at which the server acted, and the latent mean that it answered there.
     act_steps: list[int] = field(default_factory=list)
     latents: list[NDArray[np.float32]] = field(default_factory=list)
+    #: States that each act planned, from the one after its chunk on, `(plan_horizon - 1, state_dim)`; where the trial asks for them.
+    plans: list[NDArray[np.float32]] = field(default_factory=list)
     failed: bool = False
     #: Its place in the session, from 0.
     index: int = 0
