@@ -11,8 +11,8 @@
 //!
 //! ```text
 //! bin/server -> serve -> model <- train <- bin/trainer        serve and train never meet
-//! model: fit, method, noise, options, trajectory <- normalizer <- nn <- {latent | denoiser} <- config, networks <- columns <- diffusion
-//!        <- agent <- checkpoint
+//! model: fit, method, noise, options, trajectory <- normalizer <- nn <- temporal <- {latent | denoiser} <- config, networks <- columns
+//!        <- diffusion <- agent <- checkpoint
 //! (x <- y: y may use x; in braces: never each other; check, the one check of a model, stands apart)
 //! ```
 //! Only `model` and `train` know candle; only `serve` knows tokio, tonic, axum and the clock; tests in `tests/it` read the source and hold

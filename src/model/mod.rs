@@ -16,6 +16,7 @@ pub mod nn;
 pub mod noise;
 pub mod normalizer;
 pub mod options;
+pub mod temporal;
 pub mod trajectory;
 
 pub use networks::Networks;
