@@ -12,12 +12,11 @@ use super::{
         attention::Attention,
         join,
     },
-    weights::WeightsRef,
+    weights::{Weight, WeightsRef},
 };
 use candle_core::{Result, bail};
 
 pub use conv::Conv;
-pub(super) use gru::pack as gru_weight;
 pub use norm::NormKind;
 
 /// An operation on `x` `(batch, steps, channels)` and perhaps others, of the same batch. What it needs to know is here, but for its
@@ -149,6 +148,25 @@ impl Op {
         result.ok_or_else(|| candle_core::Error::Msg(format!("{self:?} does not take {:?}", shapes())))
     }
 
+    /// The weight in the form that the way forth takes where it is constant.
+    pub(super) fn pack(&self, weight: &[f32]) -> Weight {
+        match self {
+            Self::Conv(conv) => conv.pack(weight),
+            Self::Gru { hidden } => Weight::Packed(gru::pack(weight, *hidden)),
+            // Vectors; most have none at all.
+            _ => Weight::Plain(weight.to_vec()),
+        }
+    }
+
+    /// The weight in the form that the way back to the inputs takes, if that is another one.
+    pub(super) fn pack_back(&self, weight: &[f32]) -> Option<Weight> {
+        match self {
+            Self::Conv(conv) => Some(conv.pack_back(weight)),
+            Self::Gru { hidden } => Some(Weight::Packed(gru::pack_back(weight, *hidden))),
+            _ => None,
+        }
+    }
+
     /// The result into `out`. It holds the first input where that becomes the result (see [`Form`]), whose values are then not read from
     /// `inputs`; else anything. Shapes are those that [`Self::shape`] takes and gives.
     ///
@@ -188,7 +206,7 @@ impl Op {
     /// is ([`Form::Sum`]) have their slot left alone.
     ///
     /// # Errors
-    /// If a gradient is wanted for a mask, or one that needs the weight where it is packed.
+    /// If a gradient is wanted for a mask, or one that needs the weight where it is packed for the way forth alone.
     ///
     /// # Panics
     /// If there are not as many slots as inputs, and two.
