@@ -9,6 +9,8 @@ pub mod diffusion;
 pub mod fit;
 #[cfg(test)]
 mod golden;
+#[cfg(test)]
+mod gradients;
 pub mod latent;
 pub mod method;
 mod networks;
