@@ -4,6 +4,7 @@ pub mod check;
 pub mod checkpoint;
 pub mod columns;
 pub mod config;
+pub mod critic;
 pub mod denoiser;
 pub mod diffusion;
 pub mod fit;

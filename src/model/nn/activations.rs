@@ -113,6 +113,14 @@ pub trait Activations: Clone {
         self.run(&Layer::plain(Op::Step(index)), &[])
     }
 
+    /// All steps as the channels of one: `(batch, 1, steps channels)`.
+    ///
+    /// # Errors
+    /// If candle says so.
+    fn flattened(&self) -> Result<Self> {
+        self.run(&Layer::plain(Op::Flatten), &[])
+    }
+
     /// `self - other`.
     ///
     /// # Errors

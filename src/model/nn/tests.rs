@@ -195,8 +195,11 @@ fn cuts_against_central_differences() {
     let x = gaussian(1, (2, 3, 5));
     check_gradients(std::slice::from_ref(&x), &|inputs| inputs[0].channels(1, 3));
     check_gradients(std::slice::from_ref(&x), &|inputs| inputs[0].step(1));
+    check_gradients(std::slice::from_ref(&x), &|inputs| inputs[0].flattened());
     assert_eq!(bits(&x.channels(1, 3).unwrap()), bits(&x.narrow(2, 1, 3).unwrap()));
     assert_eq!(bits(&x.step(2).unwrap()), bits(&x.narrow(1, 2, 1).unwrap()));
+    let flattened = scrambled(&x, 1, 2).flattened().unwrap();
+    assert_eq!((flattened.dims(), bits(&flattened)), (&[2, 1, 15][..], bits(&x)));
 }
 
 /// The mask parts rows between the value and the vector, and gets no gradient itself.

@@ -60,6 +60,8 @@ pub enum Op {
     },
     /// One step alone, `(batch, 1, channels)`.
     Step(usize),
+    /// All steps as the channels of one: `(batch, 1, steps channels)`.
+    Flatten,
     /// `x - other`.
     Subtract,
     /// Rows where the other, `(batch, steps, 1)`, is 1; the weight, a vector, where it is 0. The mask gets no gradient.
@@ -109,7 +111,8 @@ impl Op {
     /// What becomes of the first input.
     pub fn form(&self) -> Form {
         match self {
-            Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Beside | Self::Channels { .. } | Self::Step(_) => Form::Anew,
+            Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Beside | Self::Channels { .. } => Form::Anew,
+            Self::Step(_) | Self::Flatten => Form::Anew,
             Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::Subtract | Self::OrAbsent { .. } => Form::InPlace,
             Self::AddAtEachStep | Self::AddGated => Form::Sum(1),
             Self::Add => Form::Sum(2),
@@ -141,6 +144,7 @@ impl Op {
             }
             Self::Channels { start, len } => beside(&[], start + len <= channels, [batch, steps, len]),
             Self::Step(index) => beside(&[], index < steps, [batch, 1, channels]),
+            Self::Flatten => beside(&[], true, [batch, 1, steps * channels]),
             Self::Subtract => beside(&[x], true, x),
             Self::OrAbsent { width } => beside(&[[batch, steps, 1]], channels == width, x),
         };
@@ -195,6 +199,7 @@ impl Op {
             }
             Self::Channels { start, len } => join::copy_columns((x, channels, start), (out, len, 0), len),
             Self::Step(index) => join::copy_columns((x, steps * channels, index * channels), (out, channels, 0), channels),
+            Self::Flatten => out.copy_from_slice(x),
             Self::Subtract => join::subtract(out, other(1)),
             Self::OrAbsent { .. } => join::or_absent(out, other(1), weights.plain()?),
         }
@@ -241,6 +246,7 @@ impl Op {
             Self::Step(index) => {
                 fill(&mut to[0], |dx| join::copy_columns((grad, channels, 0), (dx, steps * channels, index * channels), channels));
             }
+            Self::Flatten => fill(&mut to[0], |dx| dx.copy_from_slice(grad)),
             // The slot of `x` holds its gradient already.
             Self::Subtract => fill(&mut to[1], |dy| dy.iter_mut().zip(grad).for_each(|(dy, grad)| *dy = -grad)),
             Self::OrAbsent { .. } => {

@@ -113,6 +113,7 @@ fn joins_as_on_tensors() {
     both!("gated", [x(), value(2, 3, 5), value(3, 3, 5)], |x, _| x[0].clone().plus_gated(&x[1], &x[2]));
     both!("beside", [x(), value(2, 3, 4), value(3, 3, 1)], |x, _| Activations::beside(&[&x[0], &x[1], &x[2]]));
     both!("channels", [x()], |x, _| x[0].channels(1, 3));
+    both!("flattened", [x()], |x, _| x[0].flattened());
     both!("step", [x()], |x, _| x[0].step(1));
     both!("minus", [x(), value(2, 3, 5)], |x, _| x[0].clone().minus(&x[1]));
     both!("itself", [x()], |x, _| x[0].clone().minus(&x[0].clone().activated(Mish)?));
