@@ -1,4 +1,4 @@
-//! Time of a denoiser forward, of an act, and of a training step, on one thread.
+//! Time of a denoiser forward, of a value and its gradient, of an act, and of a training step, on one thread.
 //!
 //!     RAYON_NUM_THREADS=1 CANDLE_NUM_THREADS=1 cargo bench --bench denoiser
 
@@ -6,11 +6,12 @@ use ada_diffuser::model::{
     Networks,
     agent::{Agent, Observation},
     config::{ModelConfig, Restart},
+    critic::{Sizes, Value},
     denoiser::Given,
     diffusion::refine::{LatentRouting, RefineOptions, Standing, WindowBatch},
     latent::Tokens,
     method::{Actions, Backbone, Baseline, Future, GruLatent, LatentSource, Looks},
-    nn::{Activations, Buffer, Params},
+    nn::{Activations, Buffer, Params, Traced, gradient},
     noise::Philox,
     options::SamplerOptions,
     trajectory::{Layout, TokenRef},
@@ -40,10 +41,14 @@ fn nets() -> [(&'static str, Backbone); 3] {
 
 /// The same networks as a server has them: weights constant and packed once.
 fn frozen(config: &ModelConfig) -> Networks {
+    constant(|params| Networks::new(config.layout, &config.method, params).expect("sizes fit"))
+}
+
+fn constant<N>(build: impl Fn(&Params) -> N) -> N {
     let fresh = Params::fresh(0);
-    Networks::new(config.layout, &config.method, &fresh).expect("sizes fit");
+    build(&fresh);
     let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().copy().expect("copies"))).collect();
-    Networks::new(config.layout, &config.method, &Params::loaded(tensors)).expect("same names")
+    build(&Params::loaded(tensors))
 }
 
 fn random<V: Activations>(shape: [usize; 3]) -> V {
@@ -63,6 +68,29 @@ fn forward(c: &mut Criterion) {
                 b.iter(|| black_box(networks.denoiser.predict(&x, &condition).expect("predicts")))
             });
         }
+    }
+}
+
+/// A value, and with its gradient to the window.
+fn value(c: &mut Criterion) {
+    let sizes = Sizes { columns: STATE + ACTION, latent_dim: 20, horizon: T, widths: &[32, 64, 64] };
+    let network = constant(|params| Value::new(sizes, 150, &params.with_way_back()).expect("sizes fit"));
+    for batch in [1, 64] {
+        let (x, latents): (Buffer, Buffer) = (random([batch, T, STATE + ACTION]), random([batch, T, 20]));
+        let levels: Vec<f32> = (0..batch * T).map(|i| (i * 7 % 150) as f32).collect();
+        c.bench_function(&format!("value/forward/batch-{batch}"), |b| {
+            let given = Given { levels: &levels, latents: Some(&latents), observed: None };
+            b.iter(|| black_box(network.predict(&x, &given).expect("predicts")))
+        });
+        c.bench_function(&format!("value/gradient/batch-{batch}"), |b| {
+            b.iter(|| {
+                let run = |[x]: [Traced; 1]| {
+                    let latents = Traced::constant(latents.clone())?;
+                    network.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None })
+                };
+                black_box(gradient([x.clone()], run, |_, grad| grad.fill(1.0)).expect("has a way back"))
+            })
+        });
     }
 }
 
@@ -128,5 +156,5 @@ fn train_step(c: &mut Criterion) {
     }
 }
 
-criterion_group! { name = all; config = Criterion::default().sample_size(20).warm_up_time(std::time::Duration::from_millis(500)).measurement_time(std::time::Duration::from_secs(2)); targets = forward, act, latents, train_step }
+criterion_group! { name = all; config = Criterion::default().sample_size(20).warm_up_time(std::time::Duration::from_millis(500)).measurement_time(std::time::Duration::from_secs(2)); targets = forward, value, act, latents, train_step }
 criterion_main!(all);

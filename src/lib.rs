@@ -11,8 +11,8 @@
 //!
 //! ```text
 //! bin/server -> serve -> model <- train <- bin/trainer        serve and train never meet
-//! model: fit, method, noise, options, trajectory <- normalizer <- nn <- {latent | denoiser} <- config, networks <- columns <- diffusion
-//!        <- agent <- checkpoint
+//! model: fit, method, noise, options, trajectory <- normalizer <- nn <- temporal <- {latent | denoiser | critic} <- config, networks
+//!        <- columns <- diffusion <- agent <- checkpoint
 //! (x <- y: y may use x; in braces: never each other; check, the one check of a model, stands apart)
 //! ```
 //! Only `model` and `train` know candle; only `serve` knows tokio, tonic, axum and the clock; tests in `tests/it` read the source and hold
@@ -35,7 +35,8 @@
 //! What a model is stands in one struct, [`model::method::Method`], word for word the same in a recipe and in a checkpoint; each choice is a
 //! closed enum. [`model::check`] is the one check of it, for recipes, checkpoints and sessions.
 //!
-//! Networks are written once, over any [`model::nn::Activations`]: [`model::nn::Buffer`]s here, candle's tensors in training.
+//! Networks are written once, over any [`model::nn::Activations`]: [`model::nn::Buffer`]s here, [`model::nn::Traced`] where a sampler needs a
+//! gradient, candle's tensors in training.
 //!
 //! Training is the mirror: recipe -> data set -> its stages, each a sum of losses ([`model::latent::elbo`], [`model::diffusion::refine`]) ->
 //! [`model::checkpoint`]. Losses live beside the networks they train; [`train`] turns the crank.
@@ -49,6 +50,8 @@
 //! | a latent inferred from tokens, told by the prior, refined | [`model::latent::Encoder`], [`model::latent::Prior`], `model/agent/answers.rs` |
 //! | what is known of the present and the future when it is | [`model::latent::Evidence`] |
 //! | a second window for an act (candidates, classifier-free guidance) | [`model::agent::Act::rows`], `model/agent/rows.rs` |
+//! | what a window is worth, and the way to better ones | [`model::critic::Value`], [`model::nn::gradient()`] |
+//! | blocks that networks over windows share | [`model::temporal`] |
 //! | a layer: its shape, forward and backward | [`model::nn`], `op.rs` and one file a layer; loops in `kernels` |
 //! | what the latent found of the context, and what there was to find | [`train::probe`], `docs/identification.md` |
 //! | what is minimized, and which networks move | [`train::recipe::stages`], [`train::recipe::losses`] |

@@ -79,10 +79,22 @@ impl Golden {
 
     /// A network that serves gives these results.
     pub fn check_serving(&self, run: impl Fn(&Params) -> Result<Vec<(String, Buffer)>>) {
-        let named = self.names("p").into_iter().map(|name| (name.clone(), self.numbers[&format!("p.{name}")].clone()));
-        let params = Params::loaded(named.collect());
+        let params = self.constants();
         self.checked(run(&params).unwrap(), |y| y.to_vec());
         assert_eq!(params.unused(), Vec::<String>::new(), "{}: parameters", self.case);
+    }
+
+    /// A network that guides gives these gradients to its inputs; `run` makes them by name.
+    pub fn check_guiding(&self, run: impl Fn(&Params) -> Result<Vec<(String, Buffer)>>) {
+        let grads = run(&self.constants().with_way_back()).unwrap();
+        assert_eq!(grads.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>(), self.names("d"), "{}: gradients", self.case);
+        grads.iter().for_each(|(name, grad)| self.expect(&format!("d.{name}"), grad, GRADIENT_ERROR));
+    }
+
+    /// All parameters, as a server has them.
+    fn constants(&self) -> Params {
+        let named = self.names("p").into_iter().map(|name| (name.clone(), self.numbers[&format!("p.{name}")].clone()));
+        Params::loaded(named.collect())
     }
 
     /// All results, each as it should be.

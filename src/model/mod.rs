@@ -4,11 +4,14 @@ pub mod check;
 pub mod checkpoint;
 pub mod columns;
 pub mod config;
+pub mod critic;
 pub mod denoiser;
 pub mod diffusion;
 pub mod fit;
 #[cfg(test)]
 mod golden;
+#[cfg(test)]
+mod gradients;
 pub mod latent;
 pub mod method;
 mod networks;
@@ -16,6 +19,7 @@ pub mod nn;
 pub mod noise;
 pub mod normalizer;
 pub mod options;
+pub mod temporal;
 pub mod trajectory;
 
 pub use networks::Networks;

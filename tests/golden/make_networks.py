@@ -1,4 +1,4 @@
-"""Golden numbers for whole networks, from PyTorch: temporal U-Net, DiT, latent model with its loss, and the diffusion process.
+"""Golden numbers for whole networks, from PyTorch: temporal U-Net, DiT, value, latent model with its loss, and the diffusion process.
 
     python -m venv target/torch && target/torch/bin/pip install torch numpy safetensors
     target/torch/bin/python tests/golden/make_networks.py
@@ -7,8 +7,8 @@ Writes `networks.safetensors` beside this file. Computed in float64 and rounded 
 which holds it exactly. Activations are channels last; gradients are those of the sum over the results of `sum(y * r)`. Tensor names:
 `<case>.in.<input>`, `.y.<result>`, `.r.<result>`, `.p.<parameter>`, `.d.<input>`, `.dp.<parameter>`; parameters have the names of a
 checkpoint. The networks are written after the papers, in PyTorch's
-modules: the U-Net of Janner et al. 2022 with the mean level of a window as its time, the transformer of Peebles and Xie 2023 with a
-level for each token, and the encoder, prior and decoder of the paper's appendix A.4.
+modules: the U-Net of Janner et al. 2022 with the mean level of a window as its time, half of it as the value of a window, the
+transformer of Peebles and Xie 2023 with a level for each token, and the encoder, prior and decoder of the paper's appendix A.4.
 """
 
 from __future__ import annotations
@@ -150,6 +150,37 @@ class Denoiser(nn.Module):
         x = torch.cat([part for part in parts if part is not None], -1)
         observed = None if self.observed is None else self.observed(given["observed"][:, 0])
         return {"x0": self.backbone(x, given["levels"], observed) + self.input_skip(x)}
+
+
+class Value(nn.Module):
+    """ValueFunction of Diffuser, with the window itself beside what the way down has found of it."""
+
+    EMB = Unet.EMB
+
+    def __init__(self, latent: int, steps: int, widths: list[int]) -> None:
+        super().__init__()
+        emb, d_in = self.EMB, STATE + ACTION + latent + Denoiser.LEVEL
+        pairs = list(zip([d_in, *widths[:-1]], widths, strict=True))
+        self.time = nn.Sequential(nn.Linear(emb, 4 * emb), nn.Mish(), nn.Linear(4 * emb, emb))
+        self.down, left = nn.ModuleList(), steps
+        for depth, (a, b) in enumerate(pairs):
+            deepest = depth == len(pairs) - 1
+            halve = nn.Identity() if deepest else nn.Conv1d(b, b, 3, 2, 1)
+            self.down.append(nn.ModuleList([ResidualBlock(a, b, emb), ResidualBlock(b, b, emb), halve]))
+            left = left if deepest else (left + 1) // 2
+        self.mid = ResidualBlock(widths[-1], widths[-1], emb)
+        found = left * widths[-1]
+        hidden = max(found // 2, 1)
+        self.out = nn.Sequential(nn.Linear(found + steps * (STATE + ACTION) + emb, hidden), nn.Mish(), nn.Linear(hidden, 1))
+
+    def forward(self, given: Tensors) -> Tensors:
+        emb = self.time(sinusoid(given["levels"].mean(1), self.EMB))
+        parts = [given["x"], given.get("latents"), sinusoid(given["levels"], Denoiser.LEVEL)]
+        x = torch.cat([part for part in parts if part is not None], -1).transpose(1, 2)
+        for first, second, halve in self.down:
+            x = halve(second(first(x, emb), emb))
+        found = self.mid(x, emb).transpose(1, 2).flatten(1)
+        return {"value": self.out(torch.cat([found, given["x"].flatten(1), emb], 1))[:, None]}
 
 
 class Part(nn.Linear):
@@ -314,6 +345,14 @@ def cases() -> dict[str, tuple[nn.Module, Tensors]]:
     }
 
 
+def later_cases() -> dict[str, tuple[nn.Module, Tensors]]:
+    """The same, drawn once those are done, so that their numbers stay."""
+    return {
+        "value": (Value(4, 7, [5, 16, 3]), window(3, 7, 4, 1)),
+        "value_plain": (Value(0, 5, [6]), window(2, 5, 0, 1)),
+    }
+
+
 def our_name(name: str) -> str:
     """The name of a PyTorch parameter in a checkpoint."""
     name = name.removeprefix("backbone.")
@@ -379,11 +418,15 @@ def process() -> Tensors:
     return {"process.alphas40": alpha, "process.alphas150": alphas(150), "process.jumps": torch.stack(rows)}
 
 
+def results(cases: dict[str, tuple[nn.Module, Tensors]]) -> Tensors:
+    """What came of all cases."""
+    ran = {case: run(network, given) for case, (network, given) in cases.items()}
+    return {f"{case}.{name}": value for case, out in ran.items() for name, value in out.items()}
+
+
 def save(path: Path, cases: dict[str, tuple[nn.Module, Tensors]], beside: Tensors | None = None) -> None:
     """Runs all cases and writes what came of them, and what stands beside them."""
-    out = dict(beside or {})
-    for case, (network, given) in cases.items():
-        out |= {f"{case}.{name}": value for name, value in run(network, given).items()}
+    out = dict(beside or {}) | results(cases)
     exact = {name for name in out if name.split(".")[1] in {"in", "r", "p"}}
     held = {name: (value.half() if name in exact else value.float()).detach().contiguous() for name, value in out.items()}
     save_file(held, path)
@@ -392,7 +435,8 @@ def save(path: Path, cases: dict[str, tuple[nn.Module, Tensors]], beside: Tensor
 def main() -> None:
     torch.manual_seed(0)
     torch.set_default_dtype(torch.float64)
-    save(Path(__file__).with_name("networks.safetensors"), cases(), process())
+    first = results(cases())
+    save(Path(__file__).with_name("networks.safetensors"), later_cases(), process() | first)
 
 
 if __name__ == "__main__":

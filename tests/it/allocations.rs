@@ -1,12 +1,13 @@
-//! Going down the ladder allocates nothing once every size has been seen: counted by the test program's allocator.
+//! Going down the ladder, and gradients on the way, allocate nothing once every size has been seen: counted by the test program's allocator.
 #![allow(unsafe_code)]
 
 use ada_diffuser::model::{
     Networks,
     agent::{Act, Agent, Episode, Observation, Start},
     config::{ModelConfig, Restart},
+    critic::{Given, Sizes, Value},
     method::{Actions, Backbone, Baseline, GruLatent, Looks},
-    nn::Params,
+    nn::{Activations, Buffer, Params, Traced, gradient},
     options::{LatentMode, SamplerOptions},
     trajectory::Layout,
 };
@@ -53,10 +54,15 @@ fn agent(latent: GruLatent, backbone: Backbone, obs_horizon: usize) -> Agent {
     }
     // Every warm act is noised again a little.
     config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e7, latent_jump: f32::INFINITY, ..Restart::default() };
+    let networks = frozen(|params| Networks::new(config.layout, &config.method, params).unwrap());
+    Agent::new(config, networks, "test".into())
+}
+
+/// The same network as a server has it.
+fn frozen<N>(build: impl Fn(&Params) -> N) -> N {
     let fresh = Params::fresh(1);
-    Networks::new(config.layout, &config.method, &fresh).unwrap();
-    let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
-    Agent::new(config.clone(), Networks::new(config.layout, &config.method, &Params::loaded(tensors)).unwrap(), "test".into())
+    build(&fresh);
+    build(&Params::loaded(fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect()))
 }
 
 /// The next acts of a batch of sessions.
@@ -101,5 +107,40 @@ fn a_tick_allocates_nothing() {
         let mut again = acts(&agent, &episodes);
         assert!(asked_during(|| drop(acts(&agent, &episodes))) > 0, "the counter counts");
         assert_eq!(asked_during(|| go_down(&agent, &mut again)), 0);
+    }
+}
+
+/// A network on a window and latents.
+type Run<'a> = &'a dyn Fn([Traced; 2], &[f32]) -> candle_core::Result<Traced>;
+
+/// The first call is for every size, and those that fail on the way give everything back too.
+#[test]
+fn a_gradient_allocates_nothing() {
+    let networks = |backbone| {
+        let latent = GruLatent::plain(5, 16, Looks::Block(4));
+        let config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, Some(latent), backbone);
+        frozen(move |params| Networks::new(config.layout, &config.method, &params.with_way_back()).unwrap())
+    };
+    let unet = networks(Backbone::Unet { widths: vec![8, 16, 16] });
+    let dit = networks(Backbone::Dit { width: 16, depth: 2, heads: 2 });
+    let sizes = Sizes { columns: 5, latent_dim: 5, horizon: 8, widths: &[8, 16] };
+    let value = frozen(|params| Value::new(sizes, 40, &params.with_way_back()).unwrap());
+    let denoise = |networks: &Networks, x: Traced, latents: &Traced, levels: &[f32]| {
+        networks.denoiser.predict(&x, &Given { levels, latents: Some(latents), observed: None })
+    };
+    let runs: [Run; 3] = [
+        &|[x, latents], levels| value.predict(&x, &Given { levels, latents: Some(&latents), observed: None }),
+        &|[x, latents], levels| denoise(&unet, x, &latents, levels),
+        &|[x, latents], levels| denoise(&dit, x, &latents, levels),
+    ];
+    for (run, batch) in runs.into_iter().flat_map(|run| [(run, 9), (run, 1)]) {
+        let levels = vec![7.0; 8 * batch];
+        let input = || Buffer::generate([batch, 8, 5], |out| out.fill(0.3)).unwrap();
+        let go = |after: &dyn Fn(Traced) -> candle_core::Result<Traced>| {
+            gradient([input(), input()], |inputs| after(run(inputs, &levels)?), |_, grad| grad.fill(1.0)).is_ok()
+        };
+        assert!(asked_during(|| assert!(go(&Ok))) > 0 || batch == 1, "the counter counts");
+        (0..3).for_each(|_| assert!(!go(&|result| result.step(8))));
+        assert_eq!(asked_during(|| assert!(go(&Ok))), 0);
     }
 }

@@ -6,14 +6,15 @@ mod unet;
 use crate::model::{
     fit::{Unfit, WIDTH_MAX, require, size},
     method::{Backbone, Diffusion, Method},
-    nn::{Activation::Silu, Activations, Linear, params::Params, time_embedding::Sinusoid},
+    nn::{Activation::Silu, Activations, Linear, params::Params},
+    temporal::{EMB, LEVEL_CHANNELS, Levels, check_widths},
 };
 use candle_core::Result;
 use dit::Dit;
 use unet::Unet;
 
-/// Channels of the sinusoidal embedding of a position's level.
-const LEVEL_CHANNELS: usize = 16;
+pub use crate::model::temporal::Given;
+
 /// Hidden width of the embedding of real steps.
 const OBSERVED_HIDDEN: usize = 128;
 
@@ -29,14 +30,8 @@ pub(in crate::model) fn check(plan: &Diffusion) -> std::result::Result<(), Unfit
             let halvings = widths.len().saturating_sub(1) as u32;
             let divides = 1_usize.checked_shl(halvings).is_some_and(|factor| horizon.is_multiple_of(factor));
             let reason = format!("the horizon {horizon} must be divisible by 2^(widths - 1) = 2^{halvings}");
-            require(!widths.is_empty(), field("widths"), "must name at least one width")?;
             require(divides, field("widths"), reason)?;
-            widths.iter().try_for_each(|width| {
-                size(&field("widths"), *width, WIDTH_MAX)?;
-                let groups = unet::GROUPS.min(*width);
-                let reason = format!("{width} must be below {0} or a multiple of it", unet::GROUPS);
-                require(width.is_multiple_of(groups), field("widths"), reason)
-            })
+            check_widths(&field("widths"), widths)
         }
         Backbone::Dit { width, depth, heads } => {
             size(&field("width"), *width, WIDTH_MAX)?;
@@ -46,16 +41,6 @@ pub(in crate::model) fn check(plan: &Diffusion) -> std::result::Result<(), Unfit
             require(divides, field("heads"), format!("is {heads}, must divide the width {width}"))
         }
     }
-}
-
-/// What the denoiser knows beside the noisy window.
-pub struct Given<'a, V> {
-    /// `B * T` levels, one a position, 0 ..= level_max.
-    pub levels: &'a [f32],
-    /// `(B, T, latent_dim)`, for models with latents.
-    pub latents: Option<&'a V>,
-    /// `(B, 1, (T_o - 1) * (state_dim + action_dim))` real steps, for models with `obs_horizon > 1`.
-    pub observed: Option<&'a V>,
 }
 
 enum Net {
@@ -75,7 +60,7 @@ struct Inputs<'a, V> {
 
 /// The denoiser of a model.
 pub struct Denoiser {
-    sinusoid: Sinusoid,
+    levels: Levels,
     net: Net,
     input_skip: Linear,
     observed: Option<[Linear; 2]>,
@@ -90,7 +75,7 @@ impl Denoiser {
         let Diffusion { obs_horizon, level_max, backbone, .. } = &method.plan;
         let d_in = columns + method.latent.dim() + LEVEL_CHANNELS;
         let (net, emb) = match backbone {
-            Backbone::Unet { widths } => (Net::Unet(Box::new(Unet::new(d_in, columns, widths, params)?)), unet::EMB),
+            Backbone::Unet { widths } => (Net::Unet(Box::new(Unet::new(d_in, columns, widths, params)?)), EMB),
             Backbone::Dit { width, depth, heads } => {
                 let sizes = [d_in, columns, *width];
                 (Net::Dit(Box::new(Dit::new(sizes, [*depth, *heads], *level_max, params)?)), *width)
@@ -103,8 +88,8 @@ impl Denoiser {
                 Linear::new(OBSERVED_HIDDEN, emb, &params.scope("observed.2"))?,
             ]),
         };
-        let sinusoid = Sinusoid::new(LEVEL_CHANNELS, *level_max)?;
-        Ok(Self { sinusoid, net, input_skip: Linear::new(d_in, columns, &params.scope("input_skip"))?, observed })
+        let levels = Levels::new(*level_max)?;
+        Ok(Self { levels, net, input_skip: Linear::new(d_in, columns, &params.scope("input_skip"))?, observed })
     }
 
     /// Estimate of the clean window, `(B, T, D)` to `(B, T, D)`. Row b depends on row b of the inputs alone.
@@ -112,18 +97,7 @@ impl Denoiser {
     /// # Errors
     /// If a shape differs from the configuration, or a condition the network was built with is missing.
     pub fn predict<V: Activations>(&self, x: &V, given: &Given<V>) -> Result<V> {
-        let [batch, len, _] = x.shape()?;
-        if given.levels.len() != batch * len {
-            candle_core::bail!("{} levels for {batch} windows of {len}", given.levels.len());
-        }
-        let embedded = V::generate([batch, len, LEVEL_CHANNELS], |out| {
-            let rows = given.levels.iter().zip(out.chunks_exact_mut(LEVEL_CHANNELS));
-            rows.for_each(|(level, out)| self.sinusoid.write(*level, out));
-        })?;
-        let x = match given.latents {
-            Some(latents) => V::beside(&[x, latents, &embedded])?,
-            None => V::beside(&[x, &embedded])?,
-        };
+        let x = self.levels.beside(x, given)?;
         let inputs = Inputs { x: &x, levels: given.levels, observed: self.embed_observed(given.observed)? };
         let out = match &self.net {
             Net::Unet(net) => net.forward(&inputs)?,

@@ -12,6 +12,8 @@ use crate::model::{
 use candle_core::Tensor;
 use proptest::prelude::*;
 
+mod traced;
+
 const LAYOUT: Layout = Layout { state_dim: 3, action_dim: 2 };
 const LATENT: usize = 4;
 const LEN: usize = 8;

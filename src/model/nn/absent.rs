@@ -4,7 +4,6 @@ use super::{
     layer::Layer,
     op::Op,
     params::{Init, Params},
-    weights::Weight,
 };
 use candle_core::Result;
 
@@ -18,6 +17,6 @@ impl Absent {
     /// # Errors
     /// Those of [`Params::get`].
     pub fn new(width: usize, init: Init, p: &Params) -> Result<Self> {
-        Layer::new(Op::OrAbsent { width }, p.get(width, "absent", init)?, None, p, |absent| Weight::Plain(absent.to_vec())).map(Self)
+        Layer::new(Op::OrAbsent { width }, p.get(width, "absent", init)?, None, p).map(Self)
     }
 }

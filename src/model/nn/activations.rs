@@ -1,7 +1,8 @@
 //! What networks compute on: a network is written once, over any [`Activations`].
 //!
-//! Training runs it on candle's tensors, which record the way back; inference on [`super::Buffer`]s, plain numbers in pooled memory. Both go
-//! through the same operations ([`Op`]) and give the same bits.
+//! Training runs it on candle's tensors, which record the way back; inference on [`super::Buffer`]s, plain numbers in pooled memory;
+//! guidance on [`super::Traced`], which are such numbers and record the way back to the inputs. All go through the same operations ([`Op`])
+//! and give the same bits.
 
 use super::{Absent, kernels::activation::Activation, layer::Layer, op::Op};
 use candle_core::{Result, bail};
@@ -110,6 +111,14 @@ pub trait Activations: Clone {
     /// If there are not so many.
     fn step(&self, index: usize) -> Result<Self> {
         self.run(&Layer::plain(Op::Step(index)), &[])
+    }
+
+    /// All steps as the channels of one: `(batch, 1, steps channels)`.
+    ///
+    /// # Errors
+    /// If candle says so.
+    fn flattened(&self) -> Result<Self> {
+        self.run(&Layer::plain(Op::Flatten), &[])
     }
 
     /// `self - other`.

@@ -11,7 +11,7 @@ use candle_core::{Result, bail};
 use std::ops::{Deref, DerefMut};
 
 /// Inputs of an operation.
-const INPUTS_MAX: usize = 8;
+pub(super) const INPUTS_MAX: usize = 8;
 
 /// `(batch, steps, channels)` numbers.
 #[derive(Clone, Debug)]
@@ -21,7 +21,7 @@ pub struct Buffer {
 }
 
 impl Buffer {
-    fn view(&self) -> View<'_> {
+    pub(super) fn view(&self) -> View<'_> {
         View { values: &self.values, shape: self.shape }
     }
 }

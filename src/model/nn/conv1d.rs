@@ -5,9 +5,8 @@ use super::{
     layer::Layer,
     op::{Conv, Op},
     params::{Init, Params},
-    weights::Weight,
 };
-use candle_core::{Result, Tensor};
+use candle_core::Result;
 
 pub use super::kernels::convolution::ConvShape;
 
@@ -24,7 +23,7 @@ impl Conv1d {
         let init = Init::FanIn(shape.c_in * shape.kernel);
         let weight = p.get((shape.c_out, shape.c_in, shape.kernel), "weight", init)?;
         let bias = p.get(shape.c_out, "bias", init)?;
-        layer(Conv { shape, transposed: false }, weight, bias, p).map(Self)
+        Layer::new(Op::Conv(Conv { shape, transposed: false }), weight, Some(bias), p).map(Self)
     }
 
     /// `(B, T, c_in)` to `(B, T', c_out)`.
@@ -51,7 +50,7 @@ impl ConvTranspose1d {
         let bias = p.get(shape.c_out, "bias", init)?;
         // The transpose of a convolution from `c_in` to `c_out` is the transposed map of a convolution from `c_out` to `c_in`.
         let shape = ConvShape { c_in: shape.c_out, c_out: shape.c_in, ..shape };
-        layer(Conv { shape, transposed: true }, weight, bias, p).map(Self)
+        Layer::new(Op::Conv(Conv { shape, transposed: true }), weight, Some(bias), p).map(Self)
     }
 
     /// `(B, T, c_in)` to `(B, T', c_out)`.
@@ -61,13 +60,4 @@ impl ConvTranspose1d {
     pub fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         x.run(&self.0, &[])
     }
-}
-
-/// A layer of this convolution, packed if its weights are constant.
-pub(super) fn layer(conv: Conv, weight: Tensor, bias: Tensor, p: &Params) -> Result<Layer> {
-    let pack = |weight: &[f32]| match conv.transposed {
-        true => Weight::Phases(conv.shape.pack_spread(weight)),
-        false => Weight::Packed(conv.shape.pack_gather(weight)),
-    };
-    Layer::new(Op::Conv(conv), weight, Some(bias), p, pack)
 }

@@ -2,11 +2,9 @@
 
 use super::{
     activations::Activations,
-    conv1d::layer,
     layer::Layer,
-    op::{Conv, Op, gru_weight},
+    op::{Conv, Op},
     params::{Init, Params},
-    weights::Weight,
 };
 use candle_core::Result;
 
@@ -29,8 +27,8 @@ impl Gru {
         let (init, rows) = (Init::FanIn(hidden), 3 * hidden);
         let (weight_ih, weight_hh) = (p.get((rows, d_in), "weight_ih_l0", init)?, p.get((rows, hidden), "weight_hh_l0", init)?);
         let (bias_ih, bias_hh) = (p.get(rows, "bias_ih_l0", init)?, p.get(rows, "bias_hh_l0", init)?);
-        let states = Layer::new(Op::Gru { hidden }, weight_hh, Some(bias_hh), p, |weight| Weight::Packed(gru_weight(weight, hidden)))?;
-        Ok(Self { inputs: layer(Conv::linear(d_in, rows), weight_ih, bias_ih, p)?, states, hidden })
+        let inputs = Layer::new(Op::Conv(Conv::linear(d_in, rows)), weight_ih, Some(bias_ih), p)?;
+        Ok(Self { inputs, states: Layer::new(Op::Gru { hidden }, weight_hh, Some(bias_hh), p)?, hidden })
     }
 
     /// All states, `(B, L, H)`, from inputs `x` `(B, L, d_in)`; the state before the first is zero where none is given: `(B, 1, H)`.

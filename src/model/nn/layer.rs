@@ -4,7 +4,7 @@ use super::{
     host::values,
     op::Op,
     params::Params,
-    weights::{Constants, Weight, Weights},
+    weights::{Constants, Weights},
 };
 use candle_core::{Result, Tensor};
 use std::sync::Arc;
@@ -27,15 +27,12 @@ impl Layer {
         self.op
     }
 
-    /// An operation with a weight and perhaps a bias out of `p`; if that is frozen, as `pack` gives it.
-    pub(super) fn new(op: Op, weight: Tensor, bias: Option<Tensor>, p: &Params, pack: impl FnOnce(&[f32]) -> Weight) -> Result<Self> {
+    /// An operation with a weight and perhaps a bias out of `p`; if that is frozen, as the operation packs them.
+    pub(super) fn new(op: Op, weight: Tensor, bias: Option<Tensor>, p: &Params) -> Result<Self> {
         let Some(precision) = p.frozen() else { return Ok(Self { op, weights: Weights::Variable { weight, bias } }) };
-        let weight = match pack(&values(&weight)?) {
-            Weight::Plain(weight) => Weight::Plain(weight),
-            Weight::Packed(packed) => Weight::Packed(packed.kept().held_as(precision)),
-            Weight::Phases(phases) => Weight::Phases(phases.kept().held_as(precision)),
-        };
+        let weight = values(&weight)?;
+        let back = if p.has_way_back() { op.pack_back(&weight).map(|back| back.kept_as(precision)) } else { None };
         let bias = bias.map(|bias| values(&bias).map(|bias| bias.to_vec())).transpose()?.unwrap_or_default();
-        Ok(Self { op, weights: Weights::Constant(Arc::new(Constants { weight, bias })) })
+        Ok(Self { op, weights: Weights::Constant(Arc::new(Constants { weight: op.pack(&weight).kept_as(precision), back, bias })) })
     }
 }

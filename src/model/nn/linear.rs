@@ -2,9 +2,8 @@
 
 use super::{
     activations::Activations,
-    conv1d::layer,
     layer::Layer,
-    op::Conv,
+    op::{Conv, Op},
     params::{Init, Params},
 };
 use candle_core::Result;
@@ -28,7 +27,7 @@ impl Linear {
     /// Those of [`Params::get`].
     pub fn with_init(d_in: usize, d_out: usize, weight: Init, bias: Init, p: &Params) -> Result<Self> {
         let (weight, bias) = (p.get((d_out, d_in), "weight", weight)?, p.get(d_out, "bias", bias)?);
-        layer(Conv::linear(d_in, d_out), weight, bias, p).map(Self)
+        Layer::new(Op::Conv(Conv::linear(d_in, d_out)), weight, Some(bias), p).map(Self)
     }
 
     /// A layer that is used in parts: one parameter pair, `weight` `(sum of widths, d_in)` and its `bias`, as one layer for each width.
@@ -42,7 +41,7 @@ impl Linear {
         for (i, width) in widths.into_iter().enumerate() {
             let start = widths[..i].iter().sum();
             let (weight, bias) = (weight.narrow(0, start, width)?, bias.narrow(0, start, width)?);
-            layers.push(Self(layer(Conv::linear(d_in, width), weight, bias, p)?));
+            layers.push(Self(Layer::new(Op::Conv(Conv::linear(d_in, width)), weight, Some(bias), p)?));
         }
         layers.try_into().map_err(|_| candle_core::Error::Msg("as many layers as widths: is a bug".into()))
     }

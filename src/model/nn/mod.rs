@@ -3,8 +3,9 @@
 //! Activations are f32 on the CPU, channels last: `(batch, time, channels)`; weights have PyTorch's names and layouts. What is computed
 //! is one list of operations, [`Op`], each with its shape, forward and backward over [`kernels`]; a [`Layer`] is an operation with its
 //! parameters. Networks are written over any [`Activations`], which runs them: candle's tensors with a way back (training), [`Buffer`]s without
-//! allocating (inference). In a frozen store ([`Params::frozen`]) weights are packed once, at construction, and not held otherwise. A
-//! row's bits do not depend on the batch around it (see [`kernels`]).
+//! allocating (inference), [`Traced`] with a way back to the inputs and without allocating (guidance). In a frozen store
+//! ([`Params::frozen`]) weights are packed once, at construction, and not held otherwise; a second time for the way back where that is
+//! asked for ([`Params::with_way_back`]). A row's bits do not depend on the batch around it (see [`kernels`]).
 
 mod absent;
 mod activations;
@@ -22,10 +23,11 @@ mod op;
 pub mod params;
 mod tensor;
 #[cfg(test)]
-mod testing;
+pub(in crate::model) mod testing;
 #[cfg(test)]
 mod tests;
 pub mod time_embedding;
+pub mod traced;
 mod weights;
 
 pub use absent::Absent;
@@ -39,6 +41,7 @@ pub use linear::Linear;
 pub use norm::{GroupNormMish, LayerNorm};
 pub use op::{Form, Op, Past, Slot, View};
 pub use params::{Init, Params};
+pub use traced::{Traced, gradient};
 pub use weights::{WeightRef, WeightsRef};
 
 /// What candle says of an error, without the backtrace that it adds where `RUST_BACKTRACE` is set: that is for a debugger, not for a user.

@@ -5,7 +5,6 @@ use super::{
     layer::Layer,
     op::{NormKind, Op},
     params::{Init, Params},
-    weights::Weight,
 };
 use candle_core::{Device, Result, Tensor, bail};
 
@@ -23,7 +22,8 @@ impl GroupNormMish {
             bail!("{groups} groups do not divide {channels} channels");
         }
         let (weight, bias) = (p.get(channels, "weight", Init::Const(1.0))?, p.get(channels, "bias", Init::Const(0.0))?);
-        layer(NormKind { channels, groups, eps: 1e-5, over_time: true, mish: true }, weight, bias, p).map(Self)
+        let kind = NormKind { channels, groups, eps: 1e-5, over_time: true, mish: true };
+        Layer::new(Op::Norm(kind), weight, Some(bias), p).map(Self)
     }
 
     /// `(B, T, C)` to the same shape; statistics of an item run over the channels of a group and over time.
@@ -51,7 +51,8 @@ impl LayerNorm {
         } else {
             (Tensor::from_vec(vec![1.0_f32; dim], dim, &Device::Cpu)?, Tensor::from_vec(vec![0.0_f32; dim], dim, &Device::Cpu)?)
         };
-        layer(NormKind { channels: dim, groups: 1, eps: eps as f32, over_time: false, mish: false }, weight, bias, p).map(Self)
+        let kind = NormKind { channels: dim, groups: 1, eps: eps as f32, over_time: false, mish: false };
+        Layer::new(Op::Norm(kind), weight, Some(bias), p).map(Self)
     }
 
     /// `(B, T, dim)` to the same shape.
@@ -61,8 +62,4 @@ impl LayerNorm {
     pub fn forward<V: Activations>(&self, x: &V) -> Result<V> {
         x.run(&self.0, &[])
     }
-}
-
-fn layer(kind: NormKind, weight: Tensor, bias: Tensor, p: &Params) -> Result<Layer> {
-    Layer::new(Op::Norm(kind), weight, Some(bias), p, |weight| Weight::Plain(weight.to_vec()))
 }

@@ -28,22 +28,24 @@ enum Source {
 /// A scope in a parameter store: `params.scope("down").scope("0").get(&[32, 23, 5], "weight", init)` is the tensor `down.0.weight`.
 ///
 /// In a *fresh* store every parameter is a trainable variable, drawn from the seed and its own name (so adding a layer does not
-/// move the others). In a *loaded* store parameters are constants: layers pack them once, and keep no other copy.
+/// move the others). In a *loaded* store parameters are constants: layers pack them once, and keep no other copy; in a scope
+/// [`Self::with_way_back`] a second one.
 #[derive(Clone)]
 pub struct Params {
     source: Arc<Mutex<Source>>,
     prefix: String,
+    way_back: bool,
 }
 
 impl Params {
     /// An empty trainable store.
     pub fn fresh(seed: u64) -> Self {
-        Self { source: Arc::new(Mutex::new(Source::Fresh { seed, vars: BTreeMap::new() })), prefix: String::new() }
+        Self::of(Source::Fresh { seed, vars: BTreeMap::new() })
     }
 
     /// A store that only counts: networks over it tell how large they would be, and are good for nothing else.
     pub fn counted() -> Self {
-        Self { source: Arc::new(Mutex::new(Source::Counted { sizes: BTreeMap::new() })), prefix: String::new() }
+        Self::of(Source::Counted { sizes: BTreeMap::new() })
     }
 
     /// A store of constants, by full name.
@@ -53,21 +55,35 @@ impl Params {
 
     /// A store of constants whose weight matrices are held with this precision; biases and norms stay as they are.
     pub fn loaded_as(tensors: BTreeMap<String, Tensor>, precision: Precision) -> Self {
-        let source = Source::Loaded { tensors, used: BTreeSet::new(), frozen: Some(precision) };
-        Self { source: Arc::new(Mutex::new(source)), prefix: String::new() }
+        Self::of(Source::Loaded { tensors, used: BTreeSet::new(), frozen: Some(precision) })
     }
 
     /// A store of these tensors as they are: gradients go through layers to them.
     #[cfg(test)]
     pub(super) fn given(tensors: BTreeMap<String, Tensor>) -> Self {
-        let source = Source::Loaded { tensors, used: BTreeSet::new(), frozen: None };
-        Self { source: Arc::new(Mutex::new(source)), prefix: String::new() }
+        Self::of(Source::Loaded { tensors, used: BTreeSet::new(), frozen: None })
+    }
+
+    fn of(source: Source) -> Self {
+        Self { source: Arc::new(Mutex::new(source)), prefix: String::new(), way_back: false }
+    }
+
+    /// The same scope, whose layers can take gradients to their inputs: where parameters are constants, each holds its weight matrix a
+    /// second time, packed for that. Layers of a fresh store can in any case. There is no way back to constants themselves.
+    #[must_use]
+    pub fn with_way_back(&self) -> Self {
+        Self { way_back: true, ..self.clone() }
+    }
+
+    /// See [`Self::with_way_back`].
+    pub(super) fn has_way_back(&self) -> bool {
+        self.way_back
     }
 
     /// The same store, one name deeper.
     pub fn scope(&self, name: impl std::fmt::Display) -> Self {
         let prefix = if self.prefix.is_empty() { name.to_string() } else { format!("{}.{name}", self.prefix) };
-        Self { source: self.source.clone(), prefix }
+        Self { source: self.source.clone(), prefix, way_back: self.way_back }
     }
 
     /// If the parameters are constants (inference), so that a layer packs them at construction: how it is to hold its weights.

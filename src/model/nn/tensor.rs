@@ -5,7 +5,7 @@ use super::{
     host::{output, slice, values},
     layer::Layer,
     op::{Form, Op, Past, Slot, View},
-    weights::{Constants, WeightRef, Weights, WeightsRef},
+    weights::{Constants, Weights, WeightsRef},
 };
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, CustomOp3, Device, Layout, Result, Shape, Tensor, bail};
 use std::{ops::Deref, sync::Arc};
@@ -78,7 +78,7 @@ impl Shell {
             ([line], _) => line.split_at(self.weight_len),
             ([weight, bias, ..], _) => (*weight, *bias),
         };
-        WeightsRef { weight: WeightRef::Plain(weight), bias }
+        WeightsRef::variable(weight, bias)
     }
 
     fn views<'a>(&self, args: &[&'a [f32]], shapes: impl Iterator<Item = &'a Shape>) -> Result<Vec<View<'a>>> {

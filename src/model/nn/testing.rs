@@ -5,24 +5,24 @@ use crate::model::noise::Philox;
 use candle_core::{Device, Result, Shape, Tensor, Var};
 
 /// Seeded Gaussian values.
-pub(super) fn gaussian(seed: u64, shape: impl Into<Shape>) -> Tensor {
+pub(in crate::model) fn gaussian(seed: u64, shape: impl Into<Shape>) -> Tensor {
     let (shape, mut noise) = (shape.into(), Philox::new(seed));
     let values: Vec<f32> = (0..shape.elem_count()).map(|_| noise.normal()).collect();
     Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
 }
 
 /// All values in order.
-pub(super) fn flat(x: &Tensor) -> Vec<f32> {
+pub(in crate::model) fn flat(x: &Tensor) -> Vec<f32> {
     x.flatten_all().unwrap().to_vec1().unwrap()
 }
 
 /// All bits in order.
-pub(super) fn bits(x: &Tensor) -> Vec<u32> {
+pub(in crate::model) fn bits(x: &Tensor) -> Vec<u32> {
     flat(x).into_iter().map(f32::to_bits).collect()
 }
 
 /// The largest difference, relative to the larger of 1 and the largest value.
-pub(super) fn distance(a: &[f32], b: &[f32]) -> f32 {
+pub(in crate::model) fn distance(a: &[f32], b: &[f32]) -> f32 {
     assert_eq!(a.len(), b.len());
     let scale = b.iter().fold(1.0_f32, |top, x| top.max(x.abs()));
     a.iter().zip(b).map(|(a, b)| if (a - b).is_nan() { f32::INFINITY } else { (a - b).abs() }).fold(0.0, f32::max) / scale

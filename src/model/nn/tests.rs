@@ -86,27 +86,53 @@ fn strided_input_and_rows_alone() {
     }
 }
 
-/// Packing once at construction and packing at each call are one and the same.
+/// The parameters of a fresh store as constants.
+fn frozen(fresh: &Params, precision: Precision) -> Params {
+    let constant = |(name, var): (String, candle_core::Var)| (name, var.as_tensor().copy().unwrap());
+    Params::loaded_as(fresh.vars().into_iter().map(constant).collect(), precision)
+}
+
+/// Packing once at construction and packing at each call are one and the same, on the way back too.
 #[test]
 fn frozen_weights_give_the_same_bits() {
     for (name, x, layer) in layers() {
         let fresh = Params::fresh(5);
         let y = layer(&x, &fresh).unwrap();
-        let frozen = Params::loaded(fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().copy().unwrap())).collect());
+        let frozen = frozen(&fresh, Precision::F32);
         assert_eq!(bits(&layer(&x, &frozen).unwrap()), bits(&y), "{name}");
         assert!(frozen.unused().is_empty());
+        let to_x = |params: &Params| gradients(std::slice::from_ref(&x), &|inputs| layer(&inputs[0], params)).remove(0);
+        assert_eq!(bits(&to_x(&frozen.with_way_back())), bits(&to_x(&fresh)), "{name}");
     }
 }
 
-/// Constant weights are packed for the way forth and not held otherwise: what would need them says so.
+/// Half the bits, the same weights on both ways: those of layers whose weights were rounded before.
+#[test]
+fn the_way_back_is_as_precise_as_the_way_forth() {
+    for (name, x, layer) in layers() {
+        let fresh = Params::fresh(5);
+        layer(&x, &fresh).unwrap();
+        let half = frozen(&fresh, Precision::Bf16).with_way_back();
+        for var in fresh.vars().values().filter(|var| var.rank() > 1) {
+            var.set(&var.to_dtype(candle_core::DType::BF16).unwrap().to_dtype(candle_core::DType::F32).unwrap()).unwrap();
+        }
+        let to_x = |params: &Params| gradients(std::slice::from_ref(&x), &|inputs| layer(&inputs[0], params)).remove(0);
+        assert_eq!(bits(&to_x(&half)), bits(&to_x(&fresh)), "{name}");
+    }
+}
+
+/// Constant weights are packed for the way forth and not held otherwise, unless that was asked for: what would need them says so.
 #[test]
 fn packed_weights_have_no_way_back() {
     let fresh = Params::fresh(5);
     Linear::new(3, 2, &fresh).unwrap();
-    let frozen = Params::loaded(fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect());
+    Gru::new(3, 2, &fresh).unwrap();
+    let frozen = frozen(&fresh, Precision::F32);
     let x = candle_core::Var::from_tensor(&gaussian(1, (2, 4, 3))).unwrap();
-    let y = Linear::new(3, 2, &frozen).unwrap().forward(x.as_tensor()).unwrap();
-    assert!(y.sum_all().unwrap().backward().is_err());
+    for y in [Linear::new(3, 2, &frozen).unwrap().forward(x.as_tensor()), Gru::new(3, 2, &frozen).unwrap().forward(x.as_tensor(), None)] {
+        let error = y.unwrap().sum_all().unwrap().backward().unwrap_err();
+        assert!(plain(&error).contains("has no way back"), "{error}");
+    }
 }
 
 /// GRU inputs: x, h0, then parameters by name.
@@ -128,10 +154,15 @@ fn gru_against_central_differences() {
 
 #[test]
 fn gru_packed_once_gives_the_same_bits() {
-    let (x, h0, fresh) = (gaussian(1, (2, 3, 4)), gaussian(2, (2, 1, 20)), Params::fresh(5));
-    let y = Gru::new(4, 20, &fresh).unwrap().forward(&x, Some(&h0)).unwrap();
-    let frozen = Params::loaded(fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().copy().unwrap())).collect());
-    assert_eq!(bits(&Gru::new(4, 20, &frozen).unwrap().forward(&x, Some(&h0)).unwrap()), bits(&y));
+    let (inputs, fresh) = ([gaussian(1, (2, 3, 4)), gaussian(2, (2, 1, 20))], Params::fresh(5));
+    let run = |inputs: &[Tensor], params: &Params| Gru::new(4, 20, params)?.forward(&inputs[0], Some(&inputs[1]));
+    let y = run(&inputs, &fresh).unwrap();
+    let frozen = frozen(&fresh, Precision::F32);
+    assert_eq!(bits(&run(&inputs, &frozen).unwrap()), bits(&y));
+    let (straight, frozen) = (gradients(&inputs, &|inputs| run(inputs, &fresh)), frozen.with_way_back());
+    for (back, straight) in gradients(&inputs, &|inputs| run(inputs, &frozen)).iter().zip(&straight) {
+        assert_eq!(bits(back), bits(straight));
+    }
 }
 
 #[test]
@@ -164,8 +195,11 @@ fn cuts_against_central_differences() {
     let x = gaussian(1, (2, 3, 5));
     check_gradients(std::slice::from_ref(&x), &|inputs| inputs[0].channels(1, 3));
     check_gradients(std::slice::from_ref(&x), &|inputs| inputs[0].step(1));
+    check_gradients(std::slice::from_ref(&x), &|inputs| inputs[0].flattened());
     assert_eq!(bits(&x.channels(1, 3).unwrap()), bits(&x.narrow(2, 1, 3).unwrap()));
     assert_eq!(bits(&x.step(2).unwrap()), bits(&x.narrow(1, 2, 1).unwrap()));
+    let flattened = scrambled(&x, 1, 2).flattened().unwrap();
+    assert_eq!((flattened.dims(), bits(&flattened)), (&[2, 1, 15][..], bits(&x)));
 }
 
 /// The mask parts rows between the value and the vector, and gets no gradient itself.

@@ -2,7 +2,10 @@
 
 use super::{
     host::values,
-    kernels::{convolution::Phases, product::Packed},
+    kernels::{
+        convolution::Phases,
+        product::{Packed, Precision},
+    },
 };
 use candle_core::{Result, Tensor, bail};
 use std::sync::Arc;
@@ -24,6 +27,8 @@ pub(super) enum Weights {
 #[derive(Debug)]
 pub(super) struct Constants {
     pub(super) weight: Weight,
+    /// For the way back to the inputs, where it takes another form and somebody asked for it.
+    pub(super) back: Option<Weight>,
     pub(super) bias: Vec<f32>,
 }
 
@@ -40,6 +45,8 @@ pub(super) enum Weight {
 pub struct WeightsRef<'a> {
     /// As it is, or packed.
     pub weight: WeightRef<'a>,
+    /// Packed for the way back to the inputs, where it is at hand.
+    pub back: Option<WeightRef<'a>>,
     /// By channel of the result.
     pub bias: &'a [f32],
 }
@@ -62,7 +69,7 @@ impl Weights {
             Self::None => run(WeightsRef::NONE),
             Self::Variable { weight, bias } => {
                 let (weight, bias) = (values(weight)?, bias.as_ref().map(values).transpose()?);
-                run(WeightsRef { weight: WeightRef::Plain(&weight), bias: bias.as_deref().unwrap_or(&[]) })
+                run(WeightsRef::variable(&weight, bias.as_deref().unwrap_or(&[])))
             }
             Self::Constant(constants) => run(constants.view()),
         }
@@ -71,27 +78,59 @@ impl Weights {
 
 impl Constants {
     pub(super) fn view(&self) -> WeightsRef<'_> {
-        let weight = match &self.weight {
-            Weight::Plain(weight) => WeightRef::Plain(weight),
-            Weight::Packed(packed) => WeightRef::Packed(packed),
-            Weight::Phases(phases) => WeightRef::Phases(phases),
-        };
-        WeightsRef { weight, bias: &self.bias }
+        WeightsRef { weight: self.weight.view(), back: self.back.as_ref().map(Weight::view), bias: &self.bias }
+    }
+}
+
+impl Weight {
+    /// The same in memory of its own, a matrix with this precision.
+    pub(super) fn kept_as(self, precision: Precision) -> Self {
+        match self {
+            Self::Plain(weight) => Self::Plain(weight),
+            Self::Packed(packed) => Self::Packed(packed.kept().held_as(precision)),
+            Self::Phases(phases) => Self::Phases(phases.kept().held_as(precision)),
+        }
+    }
+
+    fn view(&self) -> WeightRef<'_> {
+        match self {
+            Self::Plain(weight) => WeightRef::Plain(weight),
+            Self::Packed(packed) => WeightRef::Packed(packed),
+            Self::Phases(phases) => WeightRef::Phases(phases),
+        }
     }
 }
 
 impl<'a> WeightsRef<'a> {
     /// None at all.
-    pub const NONE: Self = Self { weight: WeightRef::Plain(&[]), bias: &[] };
+    pub const NONE: Self = Self::variable(&[], &[]);
+
+    /// Those that may change, in the layout of the checkpoint.
+    pub const fn variable(weight: &'a [f32], bias: &'a [f32]) -> Self {
+        Self { weight: WeightRef::Plain(weight), back: None, bias }
+    }
 
     /// The weight as it is.
     ///
     /// # Errors
-    /// If it is packed: that is for the way forth alone.
+    /// If it is packed.
     pub fn plain(self) -> Result<&'a [f32]> {
         match self.weight {
             WeightRef::Plain(weight) => Ok(weight),
-            WeightRef::Packed(_) | WeightRef::Phases(_) => bail!("a packed weight has no way back"),
+            WeightRef::Packed(_) | WeightRef::Phases(_) => bail!("a packed weight cannot be read as it is"),
+        }
+    }
+
+    /// The weight as the way back to the inputs takes it: as it is, or packed for that.
+    ///
+    /// # Errors
+    /// If it is packed for the way forth alone.
+    pub fn way_back(self) -> Result<WeightRef<'a>> {
+        match (self.weight, self.back) {
+            (plain @ WeightRef::Plain(_), _) | (_, Some(plain)) => Ok(plain),
+            (WeightRef::Packed(_) | WeightRef::Phases(_), None) => {
+                bail!("a layer has no way back: its weights were packed without `Params::with_way_back`")
+            }
         }
     }
 }

@@ -5,7 +5,7 @@
 use super::{
     join, math, per_isa,
     pool::Pooled,
-    product::{Every, InLine, Left, Packed, Passes, Row, Start, even_rows, product},
+    product::{Every, InLine, Left, Packed, Row, Start, even_rows, product},
 };
 
 /// Sizes of a GRU at work.
@@ -28,6 +28,17 @@ pub struct GruRun<'a> {
     pub initial: &'a [f32],
     /// All states, `(batch, steps, hidden)`.
     pub states: &'a [f32],
+}
+
+/// Recurrent parameters on the way back.
+#[derive(Clone, Copy, Debug)]
+pub struct GruWeights<'a> {
+    /// The weight packed transposed, `(hidden, 3 hidden)`.
+    pub forth: &'a Packed,
+    /// The weight packed as it is, `(3 hidden, hidden)`.
+    pub back: &'a Packed,
+    /// By gate, `(3 hidden)`.
+    pub bias: &'a [f32],
 }
 
 /// Where backward writes; it finds zeros.
@@ -130,14 +141,12 @@ impl Gru {
         before
     }
 
-    /// Gradients from `grad`, the gradient to the states of `run`; `recurrent` is (weight `(3 hidden, hidden)`, bias).
-    pub fn backward(&self, run: GruRun, recurrent: (&[f32], &[f32]), grad: &[f32], to: GruGrads) {
+    /// Gradients from `grad`, the gradient to the states of `run`.
+    pub fn backward(&self, run: GruRun, recurrent: GruWeights, grad: &[f32], to: GruGrads) {
         let (size, row, count) = (self.hidden, 3 * self.hidden, self.batch * self.steps);
         let (before, mut projected) = (self.states_before(run), Pooled::take(count * row));
-        let forward = Packed::transposed(recurrent.0, size, (row, size), &Passes::one());
         let rows = even_rows(count, size, row, size);
-        product(Left { values: &before, terms: InLine }, &forward, Start::Bias(recurrent.1), &mut projected, rows);
-        let back = Packed::scratch(recurrent.0, (Every(size), row), (size, 1));
+        product(Left { values: &before, terms: InLine }, recurrent.forth, Start::Bias(recurrent.bias), &mut projected, rows);
         for t in (0..self.steps).rev() {
             for b in 0..self.batch {
                 let at = b * self.steps + t;
@@ -147,7 +156,7 @@ impl Gru {
                 step_back(StepBack { x: &run.inputs[at * row..][..row], p, h: &before[at * size..][..size], dx, dh });
             }
             let rows = (0..self.batch).map(|b| Row { from: (b * self.steps + t) * row, to: b * size, terms: 0..row });
-            product(Left { values: &projected, terms: InLine }, &back, Start::Out, to.initial, rows);
+            product(Left { values: &projected, terms: InLine }, recurrent.back, Start::Out, to.initial, rows);
         }
         if let Some(weight) = to.weight {
             let before = Packed::scratch(&before, (Every(size), count), (size, 1));

@@ -6,7 +6,7 @@ use crate::model::nn::{
         convolution::{ConvShape, Convolution},
         join,
     },
-    weights::{WeightRef, WeightsRef},
+    weights::{Weight, WeightRef, WeightsRef},
 };
 use candle_core::Result;
 
@@ -23,6 +23,16 @@ impl Conv {
     /// A layer without a kernel over time.
     pub fn linear(c_in: usize, c_out: usize) -> Self {
         Self { shape: ConvShape { c_in, c_out, kernel: 1, stride: 1, padding: 0 }, transposed: false }
+    }
+
+    /// The weight for the way forth.
+    pub(super) fn pack(self, weight: &[f32]) -> Weight {
+        if self.transposed { Weight::Phases(self.shape.pack_spread(weight)) } else { Weight::Packed(self.shape.pack_gather(weight)) }
+    }
+
+    /// The weight for the way back: that of a layer the other way round.
+    pub(super) fn pack_back(self, weight: &[f32]) -> Weight {
+        Self { transposed: !self.transposed, ..self }.pack(weight)
     }
 
     /// Shape of the result on `x` `[batch, steps, channels]`.
@@ -53,7 +63,7 @@ impl Conv {
         Ok(Convolution { shape: self.shape, batch, wide_steps, narrow_steps })
     }
 
-    pub(super) fn forward(self, x: View, WeightsRef { weight, bias }: WeightsRef, out: &mut [f32]) -> Result<()> {
+    pub(super) fn forward(self, x: View, WeightsRef { weight, bias, .. }: WeightsRef, out: &mut [f32]) -> Result<()> {
         let work = self.work(x.shape)?;
         match weight {
             WeightRef::Packed(packed) => work.gather(x.values, packed, Some(bias), out),
@@ -67,11 +77,11 @@ impl Conv {
     pub(super) fn backward(self, past: &Past, to: &mut [Slot]) -> Result<()> {
         let (x, dy, work) = (past.inputs[0].values, past.grad, self.work(past.inputs[0].shape)?);
         if let Some(dx) = &mut to[0] {
-            let weight = past.weights.plain()?;
-            if self.transposed {
-                work.gather(dy, &work.gather_weights(weight), None, dx);
-            } else {
-                work.spread(dy, &work.spread_weights(weight), None, dx);
+            match past.weights.way_back()? {
+                WeightRef::Packed(packed) => work.gather(dy, packed, None, dx),
+                WeightRef::Phases(phases) => work.spread(dy, phases, None, dx),
+                WeightRef::Plain(weight) if self.transposed => work.gather(dy, &work.gather_weights(weight), None, dx),
+                WeightRef::Plain(weight) => work.spread(dy, &work.spread_weights(weight), None, dx),
             }
         }
         fill(&mut to[1], |dw| if self.transposed { work.weight_grad(dy, x, dw) } else { work.weight_grad(x, dy, dw) });

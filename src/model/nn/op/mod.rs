@@ -12,12 +12,11 @@ use super::{
         attention::Attention,
         join,
     },
-    weights::WeightsRef,
+    weights::{Weight, WeightsRef},
 };
 use candle_core::{Result, bail};
 
 pub use conv::Conv;
-pub(super) use gru::pack as gru_weight;
 pub use norm::NormKind;
 
 /// An operation on `x` `(batch, steps, channels)` and perhaps others, of the same batch. What it needs to know is here, but for its
@@ -61,6 +60,8 @@ pub enum Op {
     },
     /// One step alone, `(batch, 1, channels)`.
     Step(usize),
+    /// All steps as the channels of one: `(batch, 1, steps channels)`.
+    Flatten,
     /// `x - other`.
     Subtract,
     /// Rows where the other, `(batch, steps, 1)`, is 1; the weight, a vector, where it is 0. The mask gets no gradient.
@@ -110,7 +111,8 @@ impl Op {
     /// What becomes of the first input.
     pub fn form(&self) -> Form {
         match self {
-            Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Beside | Self::Channels { .. } | Self::Step(_) => Form::Anew,
+            Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Beside | Self::Channels { .. } => Form::Anew,
+            Self::Step(_) | Self::Flatten => Form::Anew,
             Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::Subtract | Self::OrAbsent { .. } => Form::InPlace,
             Self::AddAtEachStep | Self::AddGated => Form::Sum(1),
             Self::Add => Form::Sum(2),
@@ -142,11 +144,31 @@ impl Op {
             }
             Self::Channels { start, len } => beside(&[], start + len <= channels, [batch, steps, len]),
             Self::Step(index) => beside(&[], index < steps, [batch, 1, channels]),
+            Self::Flatten => beside(&[], true, [batch, 1, steps * channels]),
             Self::Subtract => beside(&[x], true, x),
             Self::OrAbsent { width } => beside(&[[batch, steps, 1]], channels == width, x),
         };
         let shapes = || inputs.iter().map(|input| input.shape).collect::<Vec<_>>();
         result.ok_or_else(|| candle_core::Error::Msg(format!("{self:?} does not take {:?}", shapes())))
+    }
+
+    /// The weight in the form that the way forth takes where it is constant.
+    pub(super) fn pack(&self, weight: &[f32]) -> Weight {
+        match self {
+            Self::Conv(conv) => conv.pack(weight),
+            Self::Gru { hidden } => Weight::Packed(gru::pack(weight, *hidden)),
+            // Vectors; most have none at all.
+            _ => Weight::Plain(weight.to_vec()),
+        }
+    }
+
+    /// The weight in the form that the way back to the inputs takes, if that is another one.
+    pub(super) fn pack_back(&self, weight: &[f32]) -> Option<Weight> {
+        match self {
+            Self::Conv(conv) => Some(conv.pack_back(weight)),
+            Self::Gru { hidden } => Some(Weight::Packed(gru::pack_back(weight, *hidden))),
+            _ => None,
+        }
     }
 
     /// The result into `out`. It holds the first input where that becomes the result (see [`Form`]), whose values are then not read from
@@ -177,6 +199,7 @@ impl Op {
             }
             Self::Channels { start, len } => join::copy_columns((x, channels, start), (out, len, 0), len),
             Self::Step(index) => join::copy_columns((x, steps * channels, index * channels), (out, channels, 0), channels),
+            Self::Flatten => out.copy_from_slice(x),
             Self::Subtract => join::subtract(out, other(1)),
             Self::OrAbsent { .. } => join::or_absent(out, other(1), weights.plain()?),
         }
@@ -188,7 +211,7 @@ impl Op {
     /// is ([`Form::Sum`]) have their slot left alone.
     ///
     /// # Errors
-    /// If a gradient is wanted for a mask, or one that needs the weight where it is packed.
+    /// If a gradient is wanted for a mask, or one that needs the weight where it is packed for the way forth alone.
     ///
     /// # Panics
     /// If there are not as many slots as inputs, and two.
@@ -223,6 +246,7 @@ impl Op {
             Self::Step(index) => {
                 fill(&mut to[0], |dx| join::copy_columns((grad, channels, 0), (dx, steps * channels, index * channels), channels));
             }
+            Self::Flatten => fill(&mut to[0], |dx| dx.copy_from_slice(grad)),
             // The slot of `x` holds its gradient already.
             Self::Subtract => fill(&mut to[1], |dy| dy.iter_mut().zip(grad).for_each(|(dy, grad)| *dy = -grad)),
             Self::OrAbsent { .. } => {
