@@ -35,7 +35,7 @@ fn nets() -> [(&'static str, Backbone); 3] {
     [
         ("unet-narrow", Backbone::Unet { widths: vec![32, 64, 64, 64] }),
         ("unet-wide", Backbone::Unet { widths: vec![32, 64, 128, 256] }),
-        ("dit-48x2", Backbone::Dit { width: 48, depth: 2, heads: 4 }),
+        ("dit-48x2", Backbone::dit(48, 2, 4)),
     ]
 }
 
@@ -63,7 +63,7 @@ fn forward(c: &mut Criterion) {
         for batch in [1, 32] {
             let (x, latents): (Buffer, Buffer) = (random([batch, T, STATE + ACTION]), random([batch, T, 20]));
             let levels: Vec<f32> = (0..batch * T).map(|i| (i * 7 % 150) as f32).collect();
-            let condition = Given { levels: &levels, latents: Some(&latents), observed: None };
+            let condition = Given { levels: &levels, latents: Some(&latents), observed: None, told: None };
             c.bench_function(&format!("forward/{name}/batch-{batch}"), |b| {
                 b.iter(|| black_box(networks.denoiser.predict(&x, &condition).expect("predicts")))
             });
@@ -79,14 +79,14 @@ fn value(c: &mut Criterion) {
         let (x, latents): (Buffer, Buffer) = (random([batch, T, STATE + ACTION]), random([batch, T, 20]));
         let levels: Vec<f32> = (0..batch * T).map(|i| (i * 7 % 150) as f32).collect();
         c.bench_function(&format!("value/forward/batch-{batch}"), |b| {
-            let given = Given { levels: &levels, latents: Some(&latents), observed: None };
+            let given = Given { levels: &levels, latents: Some(&latents), observed: None, told: None };
             b.iter(|| black_box(network.predict(&x, &given).expect("predicts")))
         });
         c.bench_function(&format!("value/gradient/batch-{batch}"), |b| {
             b.iter(|| {
                 let run = |[x]: [Traced; 1]| {
                     let latents = Traced::constant(latents.clone())?;
-                    network.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None })
+                    network.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None, told: None })
                 };
                 black_box(gradient([x.clone()], run, |_, grad| grad.fill(1.0)).expect("has a way back"))
             })
@@ -146,6 +146,9 @@ fn train_step(c: &mut Criterion) {
             at: (0..batch_size).map(|i| Standing::Row(i % T)).collect(),
             imagined: vec![0; batch_size],
             noise: random([batch_size, T, STATE + ACTION]),
+            told: None,
+            truth: None,
+            returns: None,
         };
         let options = RefineOptions { routing: LatentRouting::Matched, first_action_weight: 10.0, sub_steps: 1, moves_latents: true };
         c.bench_function(&format!("train-step/{name}/batch-{batch_size}"), |b| {

@@ -79,7 +79,7 @@ impl Flags {
     fn config(&self) -> ModelConfig {
         let backbone = match self.net {
             Net::Unet => Backbone::Unet { widths: self.widths.clone() },
-            Net::Dit => Backbone::Dit { width: self.width, depth: self.depth, heads: self.heads },
+            Net::Dit => Backbone::dit(self.width, self.depth, self.heads),
         };
         let looks = Looks::Block(self.block_len);
         let latent = (self.latent_dim > 0).then_some(GruLatent::plain(self.latent_dim, self.hidden, looks));

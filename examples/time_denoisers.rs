@@ -111,7 +111,7 @@ fn main() -> anyhow::Result<()> {
 fn config(flags: &Flags) -> ModelConfig {
     let backbone = match flags.net {
         Net::Unet => Backbone::Unet { widths: flags.widths.clone() },
-        Net::Dit => Backbone::Dit { width: flags.width, depth: flags.depth, heads: flags.width / 32 },
+        Net::Dit => Backbone::dit(flags.width, flags.depth, flags.width / 32),
     };
     let latent = GruLatent::plain(LATENT, 64, Looks::Block(4));
     let mut config = ModelConfig::plain(LAYOUT, Some(latent), backbone);
@@ -151,7 +151,7 @@ fn rounds<V: Activations>(net: &Denoiser, (batch, len): (usize, usize), meet: &B
     let round = |_| {
         meet.wait();
         let begin = Instant::now();
-        net.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None })?;
+        net.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None, told: None })?;
         meet.wait();
         Ok(begin.elapsed().as_secs_f64() * 1e3)
     };
@@ -199,7 +199,7 @@ fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
         .collect::<anyhow::Result<_>>()?;
     let gradient = |(x, latents, target): &(Tensor, Tensor, Tensor)| -> anyhow::Result<GradStore> {
         let levels: Vec<f32> = (0..x.dim(0)? * flags.len).map(|i| (i * 7 % LEVELS) as f32).collect();
-        let y = networks.denoiser.predict(x, &Given { levels: &levels, latents: Some(latents), observed: None })?;
+        let y = networks.denoiser.predict(x, &Given { levels: &levels, latents: Some(latents), observed: None, told: None })?;
         Ok((y - target)?.sqr()?.mean_all()?.affine(1.0 / flags.threads as f64, 0.0)?.backward()?)
     };
     let gradient = &gradient;

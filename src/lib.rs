@@ -11,7 +11,7 @@
 //!
 //! ```text
 //! bin/server -> serve -> model <- train <- bin/trainer        serve and train never meet
-//! model: fit, method, noise, options, trajectory <- normalizer <- nn <- temporal <- {latent | denoiser | critic} <- config, networks
+//! model: fit, method, noise, options, trajectory <- normalizer <- nn <- temporal <- {latent | denoiser | critic | head} <- config, networks
 //!        <- columns <- diffusion <- agent <- checkpoint
 //! (x <- y: y may use x; in braces: never each other; check, the one check of a model, stands apart)
 //! ```
@@ -28,7 +28,8 @@
 //! 4. [`serve::engine`], earliest deadline first, calls [`model::agent::Agent::advance`] on all acts in flight: what they ask is answered
 //!    together, with one forward of the denoiser a tick, on pooled memory. An act that would come too late takes larger jumps. The latent is
 //!    inferred from what was really seen ([`model::latent`], by the same [`model::latent::Evidence`] as in training), refined at rung 1 by the
-//!    window itself (zig-zag), and the denoiser ([`model::denoiser`]) takes every window one row down ([`model::diffusion::descent`]).
+//!    window itself (zig-zag), and the denoiser ([`model::denoiser`]) takes every window one row down ([`model::diffusion::descent`]), led by a guide
+//!    where it is asked to be ([`model::diffusion::guidance`]). Of a plan of states inverse dynamics ([`model::head`]) make actions.
 //! 5. A finished act is a new episode and a [`model::agent::Chunk`]; the session commits both together, if the step is still the
 //!    same, and the answer goes out.
 //!
@@ -49,15 +50,18 @@
 //! | the forward process (`q_sample`), a step of the sampler | [`model::diffusion::process`], [`model::diffusion::descent`] |
 //! | a latent inferred from tokens, told by the prior, refined | [`model::latent::Encoder`], [`model::latent::Prior`], `model/agent/answers.rs` |
 //! | what is known of the present and the future when it is | [`model::latent::Evidence`] |
-//! | a second window for an act (candidates, classifier-free guidance) | [`model::agent::Act::rows`], `model/agent/rows.rs` |
-//! | what a window is worth, and the way to better ones | [`model::critic::Value`], [`model::nn::gradient()`] |
+//! | another method of the paper, or of those that it is compared with | `models/methods/`, `docs/methods.md`, [`train::recipe::Changes`] |
+//! | a second window for an act (candidates, classifier-free guidance) | [`model::agent::Act::rows`], `model/agent/candidate.rs`, `rows.rs` |
+//! | several rows of the table at once (Picard iteration) | [`model::diffusion::picard`] |
+//! | what a window is worth, and the way to better ones | [`model::critic::Value`], [`model::diffusion::guidance`], [`model::nn::gradient()`] |
+//! | actions of a plan of states | [`model::head::InverseDynamics`], [`model::diffusion::inverse`] |
 //! | blocks that networks over windows share | [`model::temporal`] |
 //! | a layer: its shape, forward and backward | [`model::nn`], `op.rs` and one file a layer; loops in `kernels` |
 //! | what the latent found of the context, and what there was to find | [`train::probe`], `docs/identification.md` |
 //! | what is minimized, and which networks move | [`train::recipe::stages`], [`train::recipe::losses`] |
 //! | which episodes a loss draws from; a batch cut from them, over the border of a session too | [`train::dataset::Which`], [`train::dataset::window`] |
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
-//! | an option of a session, from the wire to the sampler | `serve/wire.rs`, [`model::options`] |
+//! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |
 //!
 //! # Paper and code
 //! Two clocks, two letters: `t` is environment time, `k` is noise level.
@@ -67,9 +71,10 @@
 //! | K | `level_max` | T_o | `obs_horizon` |
 //! | k_i | `level`, `levels` | T_p | `horizon` (on the wire `plan_horizon`) |
 //! | abar_k | `alpha_bar` | T_a | `action_horizon` |
-//! | eps_theta | [`model::denoiser::Denoiser::predict`] (it predicts x0) | T_x | `block_len`, [`model::method::Looks`] |
+//! | eps_theta | [`model::denoiser::Denoiser::predict`] (x0, if [`model::method::Target`] says so) | T_x | `block_len`, [`model::method::Looks`] |
 //! | c_t | `latent`, `latents` | x_t | [`model::trajectory::Token`], columns by [`model::columns::Columns`] |
 //! | p_phi, q_psi, p(x given x, c) | [`model::latent::Prior`], [`model::latent::Encoder`], [`model::latent::Decoder`] | zig-zag | `kappa` |
+//! | omega | `guidance_scale` | R_hat, y | `told_return`, `told_goal` |
 #![warn(missing_docs)]
 pub mod model;
 pub mod restart;

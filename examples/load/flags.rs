@@ -1,7 +1,9 @@
 //! The command line.
 
-use ada_diffuser::serve::grpc::pb::{LatentMode, SamplerOptions};
+use ada_diffuser::serve::{grpc::pb::SamplerOptions, options::OptionsPatch};
 use clap::{Parser, ValueEnum};
+use serde::Deserialize;
+use serde_json::{Map, Value};
 use std::time::Duration;
 
 /// Clients that share a connection by default; a server lets 128 calls run on one.
@@ -111,32 +113,20 @@ impl Flags {
     /// # Errors
     /// A message that names the setting.
     pub fn options(&self) -> anyhow::Result<SamplerOptions> {
-        let mut options = SamplerOptions::default();
-        for (key, value) in &self.settings {
-            set(&mut options, key, value).map_err(|reason| anyhow::anyhow!("--set {key}={value}: {reason}"))?;
+        let mut options = Map::new();
+        for (key, text) in &self.settings {
+            options.insert(key.clone(), value(text));
+            let read = OptionsPatch::deserialize(Value::Object(options.clone()));
+            read.map_err(|reason| anyhow::anyhow!("--set {key}={text}: {reason}"))?;
         }
-        Ok(options)
+        Ok(OptionsPatch::deserialize(Value::Object(options))?.into())
     }
 }
 
-fn set(options: &mut SamplerOptions, key: &str, value: &str) -> Result<(), String> {
-    fn read<T: std::str::FromStr>(value: &str) -> Result<Option<T>, String> {
-        value.parse().map(Some).map_err(|_| format!("is not a {}", std::any::type_name::<T>()))
-    }
-    match key {
-        "streaming" => options.streaming = read(value)?,
-        "action_horizon" => options.action_horizon = read(value)?,
-        "sub_steps" => options.sub_steps = read(value)?,
-        "eta" => options.eta = read(value)?,
-        "temperature" => options.temperature = read(value)?,
-        "kappa" => options.kappa = read(value)?,
-        "latent" => {
-            let mode = LatentMode::from_str_name(&format!("LATENT_MODE_{}", value.to_uppercase()));
-            options.latent = Some(mode.ok_or("is neither mean nor sample")?.into());
-        }
-        _ => return Err("there are streaming, action_horizon, sub_steps, eta, temperature, kappa and latent".into()),
-    }
-    Ok(())
+/// What stands behind the sign: JSON where it is JSON, else a word; `inf` is infinity.
+fn value(text: &str) -> Value {
+    let word = || Value::String(if text == "inf" { "infinity".to_owned() } else { text.to_owned() });
+    serde_json::from_str(text).unwrap_or_else(|_| word())
 }
 
 fn key_value(text: &str) -> Result<(String, String), String> {
@@ -160,6 +150,7 @@ fn rate(text: &str) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ada_diffuser::serve::grpc::pb::{LatentMode, Vector};
 
     fn flags(words: &[&str]) -> Flags {
         Flags::try_parse_from([&["load"], words].concat()).unwrap()
@@ -175,15 +166,18 @@ mod tests {
 
     #[test]
     fn settings_are_read_or_named() {
-        let options = flags(&["--set", "streaming=false", "--set", "kappa=inf", "--set", "latent=sample"]).options().unwrap();
+        let words = ["streaming=false", "kappa=inf", "latent=sample", "told_goal=[0.5, 1]", "picard_window=4"];
+        let options = flags(&words.map(|word| ["--set", word]).concat()).options().unwrap();
         let expected = SamplerOptions {
             streaming: Some(false),
             kappa: Some(f32::INFINITY),
             latent: Some(LatentMode::Sample.into()),
+            told_goal: Some(Vector { values: vec![0.5, 1.0] }),
+            picard_window: Some(4),
             ..SamplerOptions::default()
         };
         assert_eq!(options, expected);
-        for (wrong, word) in [("eta=x", "eta=x"), ("color=1", "there are streaming"), ("latent=best", "neither")] {
+        for (wrong, word) in [("eta=x", "eta=x"), ("color=1", "`streaming`"), ("latent=best", "`mean` or `sample`")] {
             let error = flags(&["--set", wrong]).options().unwrap_err().to_string();
             assert!(error.contains(word), "{error}");
         }

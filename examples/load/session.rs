@@ -88,7 +88,7 @@ impl Session {
     /// Opens session `number` of a run.
     pub async fn open(agent: &mut Agent, opening: Arc<Opening>, number: u64) -> Result<Self, Failure> {
         let seed = opening.seed.wrapping_add(number);
-        let (model, options) = (opening.model.clone(), Some(opening.options));
+        let (model, options) = (opening.model.clone(), Some(opening.options.clone()));
         let answer = agent.open_session(pb::OpenSessionRequest { model, seed: Some(seed), options, ..Default::default() }).await?;
         let id = answer.into_inner().session.ok_or_else(|| Failure::new("EMPTY_RESULT"))?.session_id;
         let mut session = Self { id, committed: 0, state: vec![0.0; opening.state_dim], noise: Philox::new(seed), opening };

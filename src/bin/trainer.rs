@@ -6,7 +6,7 @@ use ada_diffuser::train::{
     flags::{Cli, Inspect, Probe, Run},
     parallel,
     probe::{self, Question},
-    recipe::Recipe,
+    recipe::{Changes, Recipe},
     report,
 };
 use anyhow::{Context, Result, anyhow};
@@ -41,9 +41,9 @@ fn start(cli: Cli) -> Result<ExitCode> {
 }
 
 fn run(flags: Run) -> Result<ExitCode> {
-    let Run { recipe, seed, out, data, mut overrides, stop_after_steps, data_memory_mib, keep_best } = flags;
+    let Run { recipe, seed, out, data, with, mut overrides, stop_after_steps, data_memory_mib, keep_best } = flags;
     overrides.extend(seed.map(|seed| format!("seed={seed}")));
-    let recipe = Recipe::read(&recipe, &overrides, data.as_deref())?;
+    let recipe = Recipe::read(&recipe, &Changes { with, overrides, data })?;
     let out = out.unwrap_or_else(|| PathBuf::from("runs").join(format!("{}-seed{}", recipe.name, recipe.seed)));
     let (stop, signal) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU8::new(0)));
     thread::spawn({

@@ -158,7 +158,9 @@ pub fn save(dir: &Path, config: &ModelConfig, tensors: &BTreeMap<String, Tensor>
 
 /// Whether an act comes out of it, of the mean state. A loader does not ask: with many levels an act takes long, and who loads acts anyway.
 fn first_act(agent: &Agent) -> Result<(), String> {
-    let mean = Observation { state: agent.config().units.normalizer.state.mean.clone(), ..Observation::default() };
+    let units = &agent.config().units;
+    let context = units.context.as_ref().map(|context| vec![context.mean.clone()]);
+    let mean = Observation { state: units.normalizer.state.mean.clone(), context, ..Observation::default() };
     let act = agent.open(0, &agent.config().defaults.sampler).and_then(|episode| agent.act(&episode, &mean));
     act.map(|_| ()).map_err(|error| format!("a first act fails: {error}"))
 }

@@ -1,22 +1,31 @@
 //! Which columns of a window are what, what of it is known beforehand, and what bounds it.
 
-use crate::model::{config::Units, trajectory::Layout};
+use crate::model::{config::Units, method::Diffused, trajectory::Layout};
 use std::ops::Range;
 
-/// Columns of one position of a window (type (i) planner, section 4.1 of the paper).
+/// Columns of one position of a window (section 4.1 of the paper: type (i) has both, type (ii) states alone).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Columns {
     /// s_t.
     pub state: Range<usize>,
-    /// a_t.
+    /// a_t; none where states alone are diffused.
     pub action: Range<usize>,
 }
 
 impl Columns {
+    /// Of a window of this kind.
+    pub fn new(diffused: Diffused, layout: Layout) -> Self {
+        let Layout { state_dim, action_dim } = layout;
+        let actions = match diffused {
+            Diffused::StateAction => action_dim,
+            Diffused::State => 0,
+        };
+        Self { state: 0..state_dim, action: state_dim..state_dim + actions }
+    }
+
     /// State and action side by side.
     pub fn state_action(layout: Layout) -> Self {
-        let Layout { state_dim, action_dim } = layout;
-        Self { state: 0..state_dim, action: state_dim..state_dim + action_dim }
+        Self::new(Diffused::StateAction, layout)
     }
 
     /// Columns of a position (D).
@@ -43,8 +52,15 @@ impl Bounds {
     pub fn new(columns: &Columns, clip: f32, units: &Units) -> Self {
         let (mut low, mut high) = (vec![-clip; columns.width()], vec![clip; columns.width()]);
         let (action_low, action_high) = units.action_bounds();
-        low[columns.action.clone()].copy_from_slice(&action_low);
-        high[columns.action.clone()].copy_from_slice(&action_high);
+        let actions = columns.action.len();
+        low[columns.action.clone()].copy_from_slice(&action_low[..actions]);
+        high[columns.action.clone()].copy_from_slice(&action_high[..actions]);
+        Self { low, high }
+    }
+
+    /// Of an action alone.
+    pub fn of_actions(units: &Units) -> Self {
+        let (low, high) = units.action_bounds();
         Self { low, high }
     }
 

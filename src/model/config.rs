@@ -1,7 +1,7 @@
 //! What a model is, apart from its weights: the content of a checkpoint's `config.json`.
 
 use crate::model::{
-    method::{Backbone, Diffusion, GruLatent, LatentSource, Method, Schedule},
+    method::{Backbone, Diffused, Diffusion, GruLatent, LatentSource, Method, Schedule, Target},
     normalizer::{Affine, Normalizer},
     options::{SamplerOptions, infinity_as_null},
     trajectory::Layout,
@@ -36,6 +36,12 @@ pub struct Units {
     pub action_high: Vec<f32>,
     /// Root mean square spread of the prior's latent mean over the training data (all dimensions pooled): the yardstick of a latent jump.
     pub latent_spread: f32,
+    /// Discounted mean of the rewards to come, units of the data: what a value of 0 means, and one of 1 more. For methods that ask for returns.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub returns: Option<Affine>,
+    /// Columns of the true context, for an oracle.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub context: Option<Affine>,
 }
 
 /// What training covered. Options outside of it are refused.
@@ -120,10 +126,11 @@ impl ModelConfig {
     /// Plain units (no normalization, actions in [-1, 1]), every gap, chunk and border trained, and defaults for everything but the sizes that must
     /// be said: where tests, benches and examples start.
     pub fn plain(layout: Layout, latent: Option<GruLatent>, backbone: Backbone) -> Self {
-        let plan = Diffusion { horizon: 8, obs_horizon: 1, level_max: 40, schedule: Schedule::Ladder, backbone, clip: 5.0 };
+        let (diffused, target, schedule) = (Diffused::StateAction, Target::X0, Schedule::LADDER);
+        let plan = Diffusion { horizon: 8, obs_horizon: 1, level_max: 40, diffused, target, schedule, backbone, clip: 5.0 };
         Self {
             layout,
-            method: Method { latent: latent.map_or(LatentSource::None, LatentSource::Gru), plan },
+            method: Method::plain(latent.map_or(LatentSource::None, LatentSource::Gru), plan),
             units: Units::plain(layout),
             trained: Trained {
                 action_horizons: (1..=8).collect(),
@@ -150,6 +157,8 @@ impl Units {
             action_low: vec![-1.0; layout.action_dim],
             action_high: vec![1.0; layout.action_dim],
             latent_spread: 1.0,
+            returns: None,
+            context: None,
         }
     }
 

@@ -1,7 +1,11 @@
 //! What a method is: one struct of closed choices, word for word the same in a recipe's `[model]` and in a checkpoint's `config.json`
 //! (section 4 of the paper; the baselines of its section 5 are other values of the same choices).
 
+mod latent;
+
 use serde::{Deserialize, Serialize};
+
+pub use latent::{Actions, Baseline, Future, GruLatent, LatentSource, Looks, TrueFuture};
 
 /// A method of acting.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -12,98 +16,116 @@ pub struct Method {
     pub latent: LatentSource,
     /// What is diffused, and how.
     pub plan: Diffusion,
-}
-
-/// What the latents of a window are made from.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "snake_case")]
-pub enum LatentSource {
-    /// There is none: the plain diffusion baselines.
-    #[default]
-    None,
-    /// The posterior of a recurrent encoder (section 4.2 of the paper).
-    Gru(GruLatent),
-}
-
-/// Sizes of a recurrent latent model, and what it looks at.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GruLatent {
-    /// Width of the latent (d_c).
-    pub dim: usize,
-    /// Hidden size of the GRU.
-    pub hidden: usize,
-    /// Real tokens it looks back on.
-    pub looks: Looks,
-    /// What the latents of later steps are.
-    #[serde(default)]
-    pub future: Future,
-    /// Leading columns that stay as they are through an episode: no prior moves them, and in training one belief has to explain a whole
-    /// sequence by them. The others move from step to step.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub stays: usize,
-    /// What needs no context; the latent explains the rest. Absent: it explains all.
+    /// How a plan becomes actions.
+    #[serde(default, skip_serializing_if = "Head::is_direct")]
+    pub head: Head,
+    /// What judges plans: it may lead a window on its way down, and chooses among candidates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub baseline: Option<Baseline>,
-    /// Columns of the recorded context that a linear head tells from the latent in training: what a simulator knows, and a robot does not.
-    /// 0: the latent is found from what happened alone, as in the paper.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub tells: usize,
-    /// Whether actions tell of what is hidden.
-    #[serde(default, skip_serializing_if = "Actions::are_evidence")]
-    pub actions: Actions,
+    pub guide: Option<Guide>,
+    /// What a session may tell of what it wants, each a condition of the denoiser (classifier-free guidance, Ho and Salimans 2022).
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub told: Vec<Told>,
+    /// Discount of the rewards to come, wherever a return is meant.
+    #[serde(default = "usual_discount", skip_serializing_if = "is_usual_discount")]
+    pub discount: f32,
 }
 
-fn is_zero(number: &usize) -> bool {
-    *number == 0
+/// Of Diffuser and Decision Diffuser.
+fn usual_discount() -> f32 {
+    0.99
 }
 
-/// What actions tell an encoder. Those of the data were chosen by an expert that may have seen the context; the agent's own follow its own
-/// belief, and a filter that takes them for news deludes itself.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Actions {
-    /// Each is a part of its token, as is how far it is from what was expected.
+fn is_usual_discount(discount: &f32) -> bool {
+    *discount == usual_discount()
+}
+
+/// How a plan becomes actions.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Head {
+    /// They are part of it: the planner of type (i) (section 4.1 of the paper).
     #[default]
-    Evidence,
-    /// None is seen but by the baseline, which says what a state was to be after it.
-    Unseen,
+    Direct,
+    /// The plan is of states alone, and each action is that which leads from one to the next: the planner of type (ii), Decision Diffuser.
+    Inverse {
+        /// Inverse dynamics.
+        network: Inverse,
+        /// Whether they see the latent of the step.
+        latent: bool,
+    },
 }
 
-impl Actions {
-    fn are_evidence(&self) -> bool {
-        *self == Self::Evidence
+impl Head {
+    /// Levels of its diffusion, if it is one.
+    pub fn level_max(&self) -> Option<usize> {
+        match self {
+            Self::Direct | Self::Inverse { network: Inverse::Mlp { .. }, .. } => None,
+            Self::Inverse { network: Inverse::Diffusion { steps, .. }, .. } => Some(*steps),
+        }
+    }
+
+    /// Whether actions are found by inverse dynamics.
+    pub fn is_inverse(&self) -> bool {
+        !self.is_direct()
+    }
+
+    fn is_direct(&self) -> bool {
+        *self == Self::Direct
     }
 }
 
-/// Models without a context, f0(s, a) of the state change and the reward and g0(s) of the action: the encoder sees how far off they are, and
-/// the decoders of the latent explain just that. What everybody knows would otherwise drown what the context does.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Baseline {
-    /// Of their two hidden layers.
-    pub width: usize,
+/// Inverse dynamics: the action that leads from one state to the next.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Inverse {
+    /// One answer (Ajay et al. 2022).
+    Mlp {
+        /// Of two hidden layers.
+        width: usize,
+    },
+    /// Diffusion of the action alone (the paper's inverse dynamics): one of several answers, where several lead there.
+    Diffusion {
+        /// Of three hidden layers.
+        width: usize,
+        /// Levels, and evaluations from noise to an action.
+        steps: usize,
+    },
 }
 
-/// What is known of the latents of steps to come.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Future {
-    /// A learned prior tells each from the one before; the posterior of a step waits for its successor (section 4.2 of the paper).
-    #[default]
-    Prior,
-    /// The belief of now holds for all of them, and is inferred without a successor (LILAC, DynaMITE).
-    Held,
+/// What judges a window.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Guide {
+    /// A network that tells the return of noisy windows (half a temporal U-Net, Janner et al. 2022).
+    Value {
+        /// Channels of each depth.
+        widths: Vec<usize>,
+    },
+    /// The rewards that the latent's decoder tells of the window's steps: no further network ("computed return" of the paper).
+    DecoderReturn,
 }
 
-/// How far an encoder looks back.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Looks {
-    /// On so many of the last tokens (T_x), each time anew.
-    Block(usize),
-    /// On all of the episode: the state of the GRU goes on from act to act.
-    Running,
+/// What a session may tell.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Told {
+    /// The return that is wanted: the discounted mean of the rewards to come.
+    Return,
+    /// The state that is wanted at the end of the window.
+    Goal {
+        /// The columns of it that are meant.
+        columns: Vec<usize>,
+    },
+}
+
+impl Told {
+    /// Numbers that tell it.
+    pub fn width(&self) -> usize {
+        match self {
+            Self::Return => 1,
+            Self::Goal { columns } => columns.len(),
+        }
+    }
 }
 
 /// A diffusion model over windows of a trajectory.
@@ -116,6 +138,12 @@ pub struct Diffusion {
     pub obs_horizon: usize,
     /// Number of diffusion levels (K).
     pub level_max: usize,
+    /// What a window is made of.
+    #[serde(default, skip_serializing_if = "Diffused::is_state_action")]
+    pub diffused: Diffused,
+    /// What the denoiser predicts.
+    #[serde(default, skip_serializing_if = "Target::is_x0")]
+    pub target: Target,
     /// The way down from noise.
     #[serde(default)]
     pub schedule: Schedule,
@@ -125,18 +153,103 @@ pub struct Diffusion {
     pub clip: f32,
 }
 
-/// In which order the positions of a window come clean.
+/// What a position of a window is made of.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Diffused {
+    /// State and action.
+    #[default]
+    StateAction,
+    /// The state alone; position 0, the current one, is known and stands clean in every row.
+    State,
+}
+
+impl Diffused {
+    fn is_state_action(&self) -> bool {
+        *self == Self::StateAction
+    }
+
+    /// The first position that is not wholly known.
+    pub fn first_free(self) -> usize {
+        match self {
+            Self::StateAction => 0,
+            Self::State => 1,
+        }
+    }
+}
+
+/// What the denoiser predicts of a window `x^k = a x0 + b eps`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Target {
+    /// The clean window.
+    #[default]
+    X0,
+    /// The noise (Ho et al. 2020).
+    Eps,
+    /// `a eps - b x0` (Salimans and Ho 2022).
+    V,
+}
+
+impl Target {
+    fn is_x0(&self) -> bool {
+        *self == Self::X0
+    }
+}
+
+/// Which level a rung of the ladder stands at.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RungMap {
+    /// `k_i = i K / T`.
+    #[default]
+    Linear,
+    /// An S-curve: rungs lie close at both ends. `s(6 (2 i / T - 1))`, brought to 0 and K; s is the logistic function.
+    Logistic,
+    /// A flatter S-curve: the same with 3 in place of 6.
+    Sigmoid,
+}
+
+impl RungMap {
+    fn is_linear(&self) -> bool {
+        *self == Self::Linear
+    }
+}
+
+/// In which order the positions of a window come clean.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Schedule {
-    /// One after the other, each a rung above the one before (section 4.1 of the paper, `k_i = i K / T`).
-    #[default]
-    Ladder,
+    /// One after the other, each a rung above the one before (section 4.1 of the paper).
+    Ladder {
+        /// The levels of the rungs.
+        #[serde(default, skip_serializing_if = "RungMap::is_linear")]
+        map: RungMap,
+    },
     /// All at once, in so many evaluations (Janner et al. 2022).
     Uniform {
         /// Network evaluations from noise to clean (S).
         steps: usize,
     },
+}
+
+impl Default for Schedule {
+    fn default() -> Self {
+        Self::LADDER
+    }
+}
+
+impl Schedule {
+    /// That of the paper: `k_i = i K / T`.
+    pub const LADDER: Self = Self::Ladder { map: RungMap::Linear };
+
+    /// Whether positions come clean one after the other, so that a window is left for the next act.
+    pub fn is_ladder(self) -> bool {
+        match self {
+            Self::Ladder { .. } => true,
+            Self::Uniform { .. } => false,
+        }
+    }
 }
 
 /// The network of a denoiser, and its sizes.
@@ -157,73 +270,70 @@ pub enum Backbone {
         depth: usize,
         /// Attention heads.
         heads: usize,
+        /// How it is told the real steps before the window.
+        #[serde(default, skip_serializing_if = "History::is_vector")]
+        history: History,
     },
 }
 
+/// How a transformer is told the real steps before a window.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum History {
+    /// All of them as one vector, added to the condition of each position.
+    #[default]
+    Vector,
+    /// As clean tokens in front of the window, which it can attend to (type (ii) planner of the paper).
+    Tokens,
+}
+
+impl History {
+    fn is_vector(&self) -> bool {
+        *self == Self::Vector
+    }
+}
+
 impl Method {
+    /// A planner of states and actions that is told nothing.
+    pub fn plain(latent: LatentSource, plan: Diffusion) -> Self {
+        Self { latent, plan, head: Head::Direct, guide: None, told: Vec::new(), discount: usual_discount() }
+    }
+
+    /// Numbers that tell a session's wishes; 0 where none are told.
+    pub fn told_width(&self) -> usize {
+        self.told.iter().map(Told::width).sum()
+    }
+
+    /// Whether its guide is a network.
+    pub fn has_value(&self) -> bool {
+        matches!(self.guide, Some(Guide::Value { .. }))
+    }
+
+    /// Whether anything of it needs the return of a step.
+    pub fn asks_for_returns(&self) -> bool {
+        self.guide.is_some() || self.told.contains(&Told::Return)
+    }
+
     /// Whether the latent of a window's first position can be refined by the window itself (zig-zag): it takes a posterior that waits for a
     /// successor, and a row at which positions 0 and 1 stand alone in front of the others.
     pub fn can_refine(&self) -> bool {
-        self.latent.gru().is_some_and(|gru| gru.future == Future::Prior) && self.plan.schedule == Schedule::Ladder
+        self.latent.gru().is_some_and(|gru| gru.future == Future::Prior) && self.plan.schedule.is_ladder()
     }
 }
 
-impl LatentSource {
-    /// The recurrent latent model, if that is what it is.
-    pub fn gru(&self) -> Option<&GruLatent> {
-        match self {
-            Self::None => None,
-            Self::Gru(gru) => Some(gru),
-        }
-    }
-
-    /// What of it needs no context, if that is told apart.
-    pub fn baseline(&self) -> Option<Baseline> {
-        self.gru().and_then(|gru| gru.baseline)
-    }
-
-    /// Columns of a recorded context that the latent tells; 0 where it tells none.
-    pub fn tells(&self) -> usize {
-        self.gru().map_or(0, |gru| gru.tells)
-    }
-
-    /// Width of the latent; 0 without one.
-    pub fn dim(&self) -> usize {
-        self.gru().map_or(0, |gru| gru.dim)
-    }
-
-    /// Real tokens of a block (T_x); 0 without a latent.
-    pub fn block_len(&self) -> usize {
-        self.gru().map_or(0, |gru| gru.block_len())
+impl Backbone {
+    /// A transformer that is told the real steps as one vector.
+    pub fn dit(width: usize, depth: usize, heads: usize) -> Self {
+        Self::Dit { width, depth, heads, history: History::Vector }
     }
 }
 
-impl Looks {
-    /// Tokens of a block; 0 where there is none.
-    pub fn block_len(self) -> usize {
-        match self {
-            Self::Block(len) => len,
-            Self::Running => 0,
+impl Diffusion {
+    /// Columns of a position of its window, of so many of states and actions.
+    pub fn width(&self, [state_dim, action_dim]: [usize; 2]) -> usize {
+        match self.diffused {
+            Diffused::StateAction => state_dim + action_dim,
+            Diffused::State => state_dim,
         }
-    }
-}
-
-impl GruLatent {
-    /// The latent of the paper: all of it moves by a learned prior, explains all, and sees all.
-    pub fn plain(dim: usize, hidden: usize, looks: Looks) -> Self {
-        Self { dim, hidden, looks, future: Future::Prior, stays: 0, baseline: None, tells: 0, actions: Actions::Evidence }
-    }
-
-    /// Width of the state that goes on from act to act; 0 where each looks anew.
-    pub fn memory_len(&self) -> usize {
-        match self.looks {
-            Looks::Block(_) => 0,
-            Looks::Running => self.hidden,
-        }
-    }
-
-    /// Real tokens of a block (T_x); 0 where there is none, the GRU running on.
-    pub fn block_len(&self) -> usize {
-        self.looks.block_len()
     }
 }

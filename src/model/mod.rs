@@ -12,6 +12,7 @@ pub mod fit;
 mod golden;
 #[cfg(test)]
 mod gradients;
+pub mod head;
 pub mod latent;
 pub mod method;
 mod networks;

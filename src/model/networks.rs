@@ -1,24 +1,46 @@
 //! The networks of one model under one parameter store.
 
-use crate::model::{denoiser::Denoiser, latent::LatentModel, method::Method, nn::params::Params, trajectory::Layout};
+use crate::model::{
+    critic::{Sizes, Value},
+    denoiser::Denoiser,
+    head::InverseDynamics,
+    latent::LatentModel,
+    method::{Diffusion, Guide, Method},
+    nn::params::Params,
+    trajectory::Layout,
+};
 use candle_core::Result;
 
-/// Latent model and denoiser; the same value trains (fresh parameters) and serves (loaded ones).
+/// Latent model, denoiser, head and guide; the same value trains (fresh parameters) and serves (loaded ones).
 pub struct Networks {
-    /// None for the plain diffusion baselines.
+    /// None for the plain diffusion baselines, and for an oracle.
     pub latent: Option<LatentModel>,
     /// The denoiser.
     pub denoiser: Denoiser,
+    /// What makes actions of a plan of states; none where they are part of it.
+    pub inverse: Option<InverseDynamics>,
+    /// What tells the worth of windows, where that is a network.
+    pub guide: Option<Value>,
 }
 
 impl Networks {
-    /// Parameters `latent.*` and `denoiser.*`.
+    /// Parameters `latent.*`, `denoiser.*`, `inverse.*` and `guide.*`.
     ///
     /// # Errors
     /// If a loaded parameter is missing or of another shape, or sizes do not fit together.
     pub fn new(layout: Layout, method: &Method, params: &Params) -> Result<Self> {
-        let latent = method.latent.gru().map(|latent| LatentModel::new(latent, layout, &params.scope("latent")));
-        let denoiser = Denoiser::new(layout.dim(), method, &params.scope("denoiser"))?;
-        Ok(Self { latent: latent.transpose()?, denoiser })
+        // A guide's gradient goes through it and what it judges by.
+        let led = if method.guide.is_some() { params.with_way_back() } else { params.clone() };
+        let latent = method.latent.gru().map(|latent| LatentModel::new(latent, layout, &led.scope("latent")));
+        let (inverse, guide) = (InverseDynamics::new(layout, method, &params.scope("inverse"))?, &led.scope("guide"));
+        let value = match &method.guide {
+            None | Some(Guide::DecoderReturn) => None,
+            Some(Guide::Value { widths }) => {
+                let Diffusion { horizon, level_max, .. } = method.plan;
+                let sizes = Sizes { columns: method.plan.width(layout.widths()), latent_dim: method.latent.dim(), horizon, widths };
+                Some(Value::new(sizes, level_max, guide)?)
+            }
+        };
+        Ok(Self { latent: latent.transpose()?, denoiser: Denoiser::new(layout, method, &led.scope("denoiser"))?, inverse, guide: value })
     }
 }

@@ -32,6 +32,12 @@ pub enum Slot {
     Renoise = 3,
     /// The epsilon of a latent.
     Latent = 4,
+    /// Inverse dynamics: an action at pure noise, and its way down.
+    Inverse = 6,
+    /// The choice among candidates.
+    Choice = 7,
+    /// A future of Monte Carlo guidance.
+    Future = 8,
     /// Anything drawn in sequence from one key: parameter initialisation, batches.
     Sequence = 5,
 }
@@ -48,9 +54,24 @@ impl Noise {
         Self { seed }
     }
 
+    /// The noise of one of several windows that are sampled side by side; the first has that of a window alone.
+    pub fn of_candidate(self, index: usize) -> Self {
+        Self { seed: self.seed ^ (index as u64).wrapping_mul(0xD1B5_4A32_D192_ED03) }
+    }
+
+    /// A number in [0, 1) of absolute environment time `time`.
+    pub fn uniform(&self, time: u64, slot: Slot) -> f32 {
+        let words = philox(self.key(time), [0, 0, time as u32, slot as u32]);
+        (words[0] >> 8) as f32 / (1 << 24) as f32
+    }
+
+    fn key(&self, time: u64) -> [u32; 2] {
+        split(self.seed ^ (time >> 32).wrapping_mul(0x9E37_79B9_7F4A_7C15))
+    }
+
     /// Fills `out` with standard Gaussian noise of absolute environment time `time`, fine level `level`, purpose `slot`.
     pub fn fill(&self, time: u64, level: u32, slot: Slot, out: &mut [f32]) {
-        let key = split(self.seed ^ (time >> 32).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        let key = self.key(time);
         for (block, four) in out.chunks_mut(4).enumerate() {
             let words = philox(key, [block as u32, level, time as u32, slot as u32]);
             let normals = gaussians(words);
@@ -156,6 +177,11 @@ mod tests {
         };
         let base = draw(1, 2, 3, Slot::Jump);
         assert_eq!(base, draw(1, 2, 3, Slot::Jump));
+        let mut beside = [0.0; 6];
+        Noise::new(1).of_candidate(1).fill(2, 3, Slot::Jump, &mut beside);
+        assert!(beside != base && Noise::new(1).of_candidate(0) == Noise::new(1));
+        let drawn: Vec<f32> = (0..1000).map(|time| Noise::new(5).uniform(time, Slot::Choice)).collect();
+        assert!((drawn.iter().sum::<f32>() / 1000.0 - 0.5).abs() < 0.03 && drawn.iter().all(|u| (0.0..1.0).contains(u)));
         for other in [draw(2, 2, 3, Slot::Jump), draw(1, 1 << 40, 3, Slot::Jump), draw(1, 2, 4, Slot::Jump), draw(1, 2, 3, Slot::Latent)] {
             assert_ne!(base, other);
         }

@@ -13,6 +13,11 @@ pub struct Layout {
 }
 
 impl Layout {
+    /// Columns of states, and of actions.
+    pub fn widths(&self) -> [usize; 2] {
+        [self.state_dim, self.action_dim]
+    }
+
     /// Columns of a window token (s, a).
     pub fn dim(&self) -> usize {
         self.state_dim + self.action_dim

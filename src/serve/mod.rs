@@ -14,6 +14,7 @@ pub mod guard;
 pub mod http;
 pub mod idle;
 pub mod listener;
+pub mod options;
 pub mod registry;
 pub mod request;
 mod seat;

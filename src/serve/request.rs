@@ -1,12 +1,10 @@
 //! What the faces hand to the service and get back, in the words of the domain.
 
 use crate::{
-    model::{
-        agent::Observation,
-        options::{LatentMode, SamplerOptions},
-    },
+    model::agent::Observation,
     serve::{
         error::ServiceError,
+        options::OptionsPatch,
         registry::Model,
         session::{Answer, Summary, Untold},
     },
@@ -39,34 +37,6 @@ pub struct Caller {
     pub face: Face,
     /// The connection.
     pub client: u64,
-}
-
-/// Overrides of a model's sampling defaults; None: as the model has it. Fields as in [`SamplerOptions`].
-#[derive(Clone, Debug, Default, PartialEq)]
-#[allow(missing_docs)]
-pub struct OptionsPatch {
-    pub streaming: Option<bool>,
-    pub action_horizon: Option<usize>,
-    pub sub_steps: Option<usize>,
-    pub eta: Option<f32>,
-    pub temperature: Option<f32>,
-    pub kappa: Option<f32>,
-    pub latent: Option<LatentMode>,
-}
-
-impl OptionsPatch {
-    pub(super) fn onto(self, default: &SamplerOptions) -> SamplerOptions {
-        let Self { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = self;
-        SamplerOptions {
-            streaming: streaming.unwrap_or(default.streaming),
-            action_horizon: action_horizon.unwrap_or(default.action_horizon),
-            sub_steps: sub_steps.unwrap_or(default.sub_steps),
-            eta: eta.unwrap_or(default.eta),
-            temperature: temperature.unwrap_or(default.temperature),
-            kappa: kappa.unwrap_or(default.kappa),
-            latent: latent.unwrap_or(default.latent),
-        }
-    }
 }
 
 /// OpenSession.

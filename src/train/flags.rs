@@ -58,7 +58,12 @@ pub struct Run {
     /// HDF5 file instead of the recipe's
     #[arg(long)]
     pub data: Option<PathBuf>,
-    /// Another value for a key of the recipe, e.g. --set stages.denoise.steps=100; may be given often
+    /// Train another method than the recipe's, e.g. --with models/methods/oracle.toml: a file of keys that it removes and sets; may be given
+    /// often
+    #[arg(long, value_name = "METHOD")]
+    pub with: Vec<PathBuf>,
+    /// Another value for a key of the recipe, e.g. --set stages.denoise.steps=100; may be given often. Nothing behind the sign takes the
+    /// key out
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub overrides: Vec<String>,
     /// Keep the checkpoint of the least held-out loss of the last stage as well, in OUT-best beside OUT; it is served like any other

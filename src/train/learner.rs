@@ -148,7 +148,7 @@ mod tests {
     use super::*;
     use crate::{
         model::{
-            method::{Baseline, LatentSource},
+            method::{Baseline, Guide, Head, Inverse, LatentSource},
             trajectory::Layout,
         },
         train::tests::recipe_with,
@@ -160,6 +160,8 @@ mod tests {
         let mut recipe = recipe_with(&[]).unwrap();
         let LatentSource::Gru(gru) = &mut recipe.model.latent else { panic!("a latent") };
         gru.baseline = Some(Baseline { width: 4 });
+        recipe.model.head = Head::Inverse { network: Inverse::Mlp { width: 4 }, latent: true };
+        recipe.model.guide = Some(Guide::Value { widths: vec![8] });
         let config = recipe.config(Layout { state_dim: 3, action_dim: 2 });
         let params = Params::fresh(0);
         Networks::new(config.layout, &config.method, &params).unwrap();

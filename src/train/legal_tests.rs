@@ -3,13 +3,14 @@
 use super::{
     Task,
     dataset::room::Room,
-    recipe::{Recipe, keys::leaves},
+    recipe::{Changes, Recipe, keys::leaves},
     tests::recipe_with,
 };
 use crate::model::{
     Networks,
     checkpoint::{Provenance, load, save},
     config::Restart,
+    method::Future,
     nn::params::Params,
 };
 use proptest::{prelude::*, sample::select};
@@ -190,11 +191,12 @@ proptest! {
 #[test]
 fn shipped_recipes_are_right_and_hold_every_key() {
     let mut count = 0;
-    let models = fs::read_dir("models").unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.is_dir());
+    let models = fs::read_dir("models").unwrap().map(|entry| entry.unwrap().path());
+    let models = models.filter(|path| path.is_dir() && !path.ends_with("methods"));
     let files = models.flat_map(|model| fs::read_dir(model).unwrap().map(|entry| entry.unwrap().path()));
     for path in files.filter(|path| path.extension().is_some_and(|extension| extension == "toml")) {
         let text = fs::read_to_string(&path).unwrap();
-        let recipe = Recipe::read(&path, &[], None).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        let recipe = Recipe::read(&path, &Changes::default()).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         let tells = recipe.model.latent.gru().is_some();
         assert!(tells || !recipe.sampler.streaming, "{}: nothing tells when a window is stale", path.display());
         let (written, known) = (toml::from_str(&text).unwrap(), toml::from_str(&recipe.to_toml()).unwrap());
@@ -203,4 +205,29 @@ fn shipped_recipes_are_right_and_hold_every_key() {
         count += 1;
     }
     assert!(count >= 9);
+}
+
+/// N methods and M environments are N + M files: each method that ships fits the recipes of each environment, but where it says why not.
+#[test]
+fn every_method_fits_every_environment() {
+    let files = |dir: &str| fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()).collect::<Vec<_>>();
+    let names = ["recipe.toml", "surprises.toml", "sessions.toml", "told.toml", "play.toml"];
+    let recipes = files("models").into_iter().flat_map(|dir| names.map(|name| dir.join(name)));
+    let (recipes, methods) = (recipes.filter(|path| path.is_file()).collect::<Vec<_>>(), files("models/methods"));
+    assert!(recipes.len() >= 8 && methods.len() >= 20);
+    for (recipe, method) in recipes.iter().flat_map(|recipe| methods.iter().map(move |method| (recipe, method))) {
+        let changes = Changes { with: vec![method.clone()], ..Changes::default() };
+        let (read, plain) = (Recipe::read(recipe, &changes), Recipe::read(recipe, &Changes::default()).unwrap());
+        let (stem, beside_baseline) = (method.file_stem().unwrap().to_str().unwrap(), plain.model.latent.baseline().is_some());
+        let held = plain.model.latent.gru().is_some_and(|gru| gru.future == Future::Held);
+        match read {
+            Ok(read) => {
+                assert_eq!(read.name, format!("{}-{stem}", plain.name));
+                assert_ne!(Recipe { name: plain.name.clone(), ..read }, plain, "{stem} changes nothing");
+            }
+            Err(error) if stem == "computed-return" && beside_baseline => assert!(error.to_string().contains("model.guide"), "{error}"),
+            Err(error) if stem == "literal" && held => assert!(error.to_string().contains("losses.denoise.routing"), "{error}"),
+            Err(error) => panic!("{} with {}: {error}", recipe.display(), method.display()),
+        }
+    }
 }

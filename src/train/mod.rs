@@ -8,6 +8,8 @@ pub mod dataset;
 pub mod defaults;
 pub mod flags;
 pub mod gate;
+#[cfg(test)]
+mod head_tests;
 pub mod judgement;
 pub mod learner;
 #[cfg(test)]
@@ -31,14 +33,14 @@ mod tests;
 
 use crate::model::{
     checkpoint::is_name,
-    config::{ModelConfig, Trained},
-    method::Looks,
+    config::{ModelConfig, Trained, Units},
+    method::{LatentSource, Looks, Method},
     normalizer::Affine,
 };
 use anyhow::{Context, Result, ensure};
 use crank::Crank;
 use dataset::{
-    Episode, Sides, Split, UnitsFrom, Which, hdf5,
+    Episode, Sides, Split, UnitsFrom, Which, hdf5, returns,
     room::Room,
     units::{self, ActionColumn},
 };
@@ -107,17 +109,21 @@ impl Task {
     ///
     /// # Errors
     /// If the data set cannot be read or does not fit the recipe.
-    pub fn new(recipe: Recipe, room: &Room) -> Result<Self> {
+    pub fn new(mut recipe: Recipe, room: &Room) -> Result<Self> {
         let mut dataset = hdf5::read(&recipe.data, room)?;
+        if let LatentSource::Truth { dim: dim @ 0, .. } = &mut recipe.model.latent {
+            *dim = dataset.context_dim();
+            ensure!(*dim > 0, "recipe: `model.latent`: {} has no `infos/context` that an oracle could be told", recipe.data.display());
+        }
         let (len, why) = recipe.episode_len_min();
         dataset.leave_out_shorter(len, &why)?;
         if let Some(key) = recipe.probe_key() {
             ensure!(dataset.context_dim() > 0, "recipe: `{key}`: {} has no `infos/context` to probe for", recipe.data.display());
         }
-        let (tells, recorded) = (recipe.model.latent.tells(), dataset.context_dim());
+        let ((key, tells), recorded) = (context_asked(&recipe.model), dataset.context_dim());
         ensure!(
             tells == 0 || tells == recorded,
-            "recipe: `model.latent.tells`: is {tells}, but `infos/context` in {} has {recorded} columns",
+            "recipe: `{key}`: is {tells}, but `infos/context` in {} has {recorded} columns",
             recipe.data.display()
         );
         let (layout, notes, dataset_digest) = (dataset.layout(), std::mem::take(&mut dataset.notes), dataset.digest.clone());
@@ -125,10 +131,16 @@ impl Task {
         enough(&recipe, &split.episodes)?;
         let sessions = split.episodes.train.iter().any(|episode| episode.reach() > 0);
         let plain = recipe.config(layout);
-        let config = ModelConfig { units: split.units.clone(), trained: Trained { sessions, ..plain.trained.clone() }, ..plain };
+        let context_units = units_of_context(&split.episodes.train, tells)?;
+        let units = units_of_method(&recipe.model, &split, &context_units)?;
+        let mut config = ModelConfig { units, trained: Trained { sessions, ..plain.trained.clone() }, ..plain };
+        if recipe.tells_high_return() {
+            let imitated = split.episodes.only(Which::Demonstrations).train;
+            let high = returns::high(&imitated, recipe.model.discount, &config.units.normalizer.reward)?;
+            config.defaults.sampler.told_return = Some(high);
+        }
         // The recipe was checked with plain units; now the data's are known.
         config.check().with_context(|| format!("data set {} makes no model", recipe.data.display()))?;
-        let context_units = units_of_context(&split.episodes.train, tells)?;
         let task = Self { context_units, recipe, split, action_columns, dataset_digest, config, notes, room: room.clone() };
         if let Some(key) = task.recipe.probe_key() {
             ensure!(
@@ -166,6 +178,25 @@ fn enough(recipe: &Recipe, episodes: &Sides) -> Result<()> {
         );
     }
     Ok(())
+}
+
+/// The key of a recipe that asks for columns of the recorded context, and how many.
+fn context_asked(method: &Method) -> (&'static str, usize) {
+    match method.latent.truth() {
+        Some((dim, _)) => ("model.latent.dim", dim),
+        None => ("model.latent.tells", method.latent.tells()),
+    }
+}
+
+/// The data's units, and those that this method alone needs.
+fn units_of_method(method: &Method, split: &Split, context: &Affine) -> Result<Units> {
+    let imitated = split.episodes.only(Which::Demonstrations).train;
+    let returns = || returns::fit(&imitated, method.discount, &split.units.normalizer.reward);
+    Ok(Units {
+        returns: method.asks_for_returns().then(returns).transpose()?,
+        context: method.latent.truth().map(|_| context.clone()),
+        ..split.units.clone()
+    })
 }
 
 /// Mean and standard deviation of each of the columns over these episodes.

@@ -4,7 +4,9 @@
 use super::{
     dataset::{
         Episode, Sides, Span,
+        beside::Beside,
         hidden::Hide,
+        returns::Returns,
         room::Room,
         surprises::surprising,
         window::{Levels, Places, WindowShape, windows},
@@ -19,7 +21,10 @@ use crate::model::{
         schedule::Table,
     },
     latent,
-    method::{Actions, Backbone, Baseline, Future, GruLatent, LatentSource, Looks, Schedule},
+    method::{
+        Actions, Backbone, Baseline, Diffused, Future, GruLatent, Head, Inverse, LatentSource, Looks, RungMap, Schedule, Target, Told,
+        TrueFuture,
+    },
     nn::Params,
     noise::Philox,
     options::SamplerOptions,
@@ -78,7 +83,7 @@ fn episodes(before: usize) -> Vec<Episode> {
     let (mut rng, all) = (Philox::new(3), before + STEPS);
     let mut numbers = |count: usize, scale: f32| (0..count).map(|_| scale * (2.0 * rng.uniform() - 1.0)).collect::<Vec<f32>>();
     let mut episode = || {
-        let columns = [numbers(all * 3, 2.0), numbers(all * 2, 1.0), numbers(all, 1.0), Vec::new()];
+        let columns = [numbers(all * 3, 2.0), numbers(all * 2, 1.0), numbers(all, 1.0), numbers(all * 2, 1.0)];
         Episode::among(LAYOUT, columns, Span { rows: before..all, play: false, before: (before > 0).then_some(0..before) })
     };
     (0..3).map(|_| episode()).collect()
@@ -150,11 +155,17 @@ fn check_with(agent: &Agent, episodes: &[Episode], config: &ModelConfig, hide: H
         horizon: plan.horizon,
         looks: config.method.latent.gru().map_or(Looks::Block(plan.obs_horizon), |gru| gru.looks),
         obs_horizon: plan.obs_horizon,
-        table: Table::new(plan.schedule, plan.horizon, sampler.sub_steps, plan.level_max).unwrap(),
+        table: Table::of(plan, sampler.sub_steps).unwrap(),
         levels: Levels::Schedule,
         action_horizons: if config.trained.refined || latents_free { config.trained.action_horizons.clone() } else { vec![1] },
         ready_fraction: 0.5,
         hide,
+        beside: Beside {
+            told: config.method.told.clone(),
+            told_hidden: 0.3,
+            returns: Returns::of(config.method.discount, &config.units),
+            truth: config.method.latent.truth().map(|(dim, future)| (Affine::identity(dim), future)),
+        },
     };
     let options =
         RefineOptions { routing: LatentRouting::Matched, first_action_weight: 1.0, sub_steps: sampler.sub_steps, moves_latents: true };
@@ -173,50 +184,64 @@ fn check_with(agent: &Agent, episodes: &[Episode], config: &ModelConfig, hide: H
                 // No act has given out more than it has lived through.
                 continue;
             }
-            assert_same(agent, &one, [&trained, &[x_ready, Vec::new(), Vec::new(), Vec::new()]], start);
+            assert_same(agent, &one, (&trained, &x_ready), start);
             seen_rows.insert(at);
         }
     }
     assert_eq!(seen_rows.len(), shape.table.emit(), "every row");
 }
 
-fn assert_same(agent: &Agent, one: &WindowBatch, [trained, ready]: [&[Vec<f32>; 4]; 2], start: usize) {
+fn assert_same(agent: &Agent, one: &WindowBatch, (trained, x_ready): (&[Vec<f32>; 5], &[f32]), start: usize) {
     let (imagined, Standing::Row(row)) = (one.imagined[0], one.at[0].clone()) else { panic!("a row") };
     let episode = begun(agent, one, start);
-    let given: Vec<f32> = match imagined {
-        0 => Vec::new(),
-        steps => {
-            let (state, action, len) = (numbers(&one.history.state, 0), numbers(&one.history.action, 0), history_len(one, 0));
-            (len - steps..len).flat_map(|i| [&state[3 * i..3 * i + 3], &action[2 * i..2 * i + 2]].concat()).collect()
-        }
-    };
-    let state = numbers(&one.window, 0)[..3].to_vec();
-    let observation = Observation { state, executed: told(one, 0, start, imagined), nothing_executed: false };
+    let (states, actions, len) = (numbers(&one.history.state, 0), numbers(&one.history.action, 0), history_len(one, 0));
+    let whole = agent.config().method.plan.diffused == Diffused::StateAction;
+    let given_out = |i: usize| [&states[3 * i..3 * i + 3], if whole { &actions[2 * i..2 * i + 2] } else { &[] }].concat();
+    let given: Vec<f32> = (len - imagined.min(len)..len).flat_map(given_out).collect();
+    let executed = told(one, 0, start, imagined);
+    let context = one.truth.as_ref().map(|truth| numbers(truth, 0).chunks(2).map(<[f32]>::to_vec).collect::<Vec<_>>());
+    let held = matches!(agent.config().method.latent.truth(), Some((_, TrueFuture::Held)));
+    let context = context.map(|mut rows| {
+        rows.truncate(if held { 1 } else { rows.len() });
+        rows
+    });
+    let observation = Observation { state: numbers(&one.window, 0)[..3].to_vec(), executed, nothing_executed: false, context };
     let act = agent.begin(&episode, &observation).unwrap();
-    let served = agent.read_in_serving(act, row, [&trained[0], &ready[0], &given]).unwrap();
-    for (what, (trained, served)) in ["x", "levels", "latents", "history"].iter().zip(trained.iter().zip(&served)) {
+    let of_given = &actions[2 * (len - imagined.min(len))..];
+    let served = agent.read_in_serving(act, row, [&trained[0], x_ready, &given, &of_given[..2 * imagined]]).unwrap();
+    for (what, (trained, served)) in ["x", "levels", "latents", "history", "told"].iter().zip(trained.iter().zip(&served)) {
         let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
         assert_eq!(bits(trained), bits(served), "{what} in row {}, {imagined} imagined, from step {start}", row);
     }
 }
 
+/// The wishes that the window was told of.
+fn wishes(agent: &Agent, one: &WindowBatch) -> SamplerOptions {
+    let sampler = agent.config().defaults.sampler.clone();
+    let told = one.told.as_ref().map_or(Vec::new(), |told| numbers(told, 0));
+    if told.last() != Some(&1.0) {
+        return sampler;
+    }
+    SamplerOptions { told_return: Some(told[0]), told_goal: Some(told[1..told.len() - 1].to_vec()), ..sampler }
+}
+
 /// A session at the start of the episode in which the window begins at step `start`: fresh, or reset after the episode before, of which the
 /// last token of the history that lies before this episode is the border.
 fn begun(agent: &Agent, one: &WindowBatch, start: usize) -> crate::model::agent::Episode {
-    let fresh = agent.open(1, &agent.config().defaults.sampler).unwrap();
+    let fresh = agent.open(1, &wishes(agent, one)).unwrap();
     let earlier = history_len(one, 0).saturating_sub(start);
     let shows_any = numbers(&one.history.present, 0)[..3 * earlier].contains(&1.0);
     if earlier == 0 || !(shows_any || one.history_lens.is_some()) {
         return fresh;
     }
-    let last = Observation { state: vec![0.0; 3], executed: executed(one, 0, 0..earlier - 1), nothing_executed: false };
+    let last = Observation { state: vec![0.0; 3], executed: executed(one, 0, 0..earlier - 1), nothing_executed: false, context: None };
     let (lived, _) = agent.act(&fresh, &last).unwrap();
     agent.reset(&lived, 1, true).unwrap()
 }
 
 #[test]
 fn sessions() {
-    let (ladder, hide) = (Schedule::Ladder, Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    let (ladder, hide) = (Schedule::LADDER, Hide { state: 0.4, action: 0.4, reward: 0.4 });
     for (looks, future, obs_horizon) in
         [(Looks::Block(6), Future::Prior, 3), (Looks::Running, Future::Prior, 1), (Looks::Running, Future::Held, 3)]
     {
@@ -230,7 +255,7 @@ fn sessions() {
 
 #[test]
 fn whole_histories() {
-    let (ladder, uniform) = (Schedule::Ladder, Schedule::Uniform { steps: 7 });
+    let (ladder, uniform) = (Schedule::LADDER, Schedule::Uniform { steps: 7 });
     for (latent, schedule, obs_horizon, sub_steps) in [
         (Some((Looks::Block(6), Future::Prior)), ladder, 1, 1),
         (Some((Looks::Block(6), Future::Prior)), ladder, 3, 1),
@@ -249,7 +274,7 @@ fn whole_histories() {
 
 #[test]
 fn surprises() {
-    let (ladder, hide) = (Schedule::Ladder, Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    let (ladder, hide) = (Schedule::LADDER, Hide { state: 0.4, action: 0.4, reward: 0.4 });
     for (looks, future, obs_horizon) in
         [(Looks::Block(6), Future::Prior, 1), (Looks::Running, Future::Prior, 3), (Looks::Running, Future::Held, 1)]
     {
@@ -259,8 +284,61 @@ fn surprises() {
     }
 }
 
+/// States alone: position 0 is known and stands clean, and no token of the window has an action.
+fn of_states(mut config: ModelConfig) -> ModelConfig {
+    config.method.plan.diffused = Diffused::State;
+    let latent = config.method.latent.dim() > 0;
+    config.method.head = Head::Inverse { network: Inverse::Mlp { width: 8 }, latent };
+    config.check().unwrap();
+    config
+}
+
+#[test]
+fn windows_of_states() {
+    let (ladder, hide) = (Schedule::LADDER, Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    for (latent, schedule, obs_horizon, sub_steps) in [
+        (Some((Looks::Block(6), Future::Prior)), ladder, 1, 1),
+        (Some((Looks::Block(6), Future::Prior)), ladder, 3, 2),
+        (Some((Looks::Running, Future::Held)), ladder, 2, 1),
+        (Some((Looks::Running, Future::Prior)), Schedule::Ladder { map: RungMap::Sigmoid }, 1, 1),
+        (None, Schedule::Uniform { steps: 7 }, 3, 1),
+    ] {
+        let config = of_states(config(latent, schedule, obs_horizon, sub_steps));
+        [Hide::NOTHING, hide].into_iter().for_each(|hide| check(&config, hide));
+    }
+}
+
+/// Returns and goals, told or not, at windows that predict noise.
+#[test]
+fn wishes_that_are_told() {
+    for (diffused, target) in [(false, Target::Eps), (true, Target::V)] {
+        let plain = config(Some((Looks::Block(6), Future::Prior)), Schedule::LADDER, 1, 1);
+        let mut config = if diffused { of_states(plain) } else { plain };
+        config.method.plan.target = target;
+        config.method.told = vec![Told::Return, Told::Goal { columns: vec![2, 0] }];
+        config.units.returns = Some(Affine::identity(1));
+        config.check().unwrap();
+        check(&config, Hide::NOTHING);
+    }
+}
+
+/// An oracle is told the context of now or of every step.
+#[test]
+fn true_contexts() {
+    for future in [TrueFuture::Held, TrueFuture::Known] {
+        let mut config = config(None, Schedule::LADDER, 2, 1);
+        config.method.latent = LatentSource::Truth { dim: 2, future };
+        config.units.context = Some(Affine::identity(2));
+        if future == TrueFuture::Known {
+            (config.trained.action_horizons, config.defaults.sampler.action_horizon) = (vec![1], 1);
+        }
+        config.check().unwrap();
+        check(&config, Hide::NOTHING);
+    }
+}
+
 #[test]
 fn histories_with_gaps() {
-    check(&config(Some((Looks::Running, Future::Held)), Schedule::Ladder, 1, 1), Hide { state: 0.4, action: 0.4, reward: 0.4 });
-    check(&config(Some((Looks::Block(6), Future::Prior)), Schedule::Ladder, 3, 2), Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    check(&config(Some((Looks::Running, Future::Held)), Schedule::LADDER, 1, 1), Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    check(&config(Some((Looks::Block(6), Future::Prior)), Schedule::LADDER, 3, 2), Hide { state: 0.4, action: 0.4, reward: 0.4 });
 }

@@ -6,7 +6,7 @@ use super::{
     learner::Learner,
     losses::Objective,
     probe::{AGES, Answer, Question, Score, Source, probe},
-    recipe::Recipe,
+    recipe::{Changes, Recipe},
     resume, run,
 };
 use crate::model::{checkpoint, method::Looks};
@@ -22,7 +22,7 @@ pub(super) fn recipe_with(overrides: &[&str]) -> Result<Recipe, super::recipe::R
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("recipe.toml");
     fs::write(&path, RECIPE).unwrap();
-    Recipe::read(&path, &overrides.iter().map(|text| text.to_string()).collect::<Vec<_>>(), None)
+    Recipe::read(&path, &Changes::values(overrides))
 }
 
 /// A run in a thread with the stack that backward needs.
@@ -167,7 +167,7 @@ fn a_baseline_has_one_stage() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("recipe.toml");
     fs::write(&path, text).unwrap();
-    let recipe = Recipe::read(&path, &["stages.denoise.steps=2".to_string()], None).unwrap();
+    let recipe = Recipe::read(&path, &Changes::values(&["stages.denoise.steps=2"])).unwrap();
     let out = dir.path().join("out");
     assert_eq!(run(recipe, options(&out, None)).unwrap(), Outcome::Finished);
     let agent = checkpoint::load(&out).unwrap();
@@ -192,7 +192,7 @@ fn beside_a_baseline(dir: &Path) -> Recipe {
                  learning_rate = { peak = 1e-2, end = 1e-4, warm_up = 2, decay = \"cosine\" }\nweight_decay = 0.0\n";
     let path = dir.join("recipe.toml");
     fs::write(&path, RECIPE.replacen("[[stages]]", &format!("{stage}[[stages]]"), 1)).unwrap();
-    Recipe::read(&path, &BESIDE_A_BASELINE.map(String::from), None).unwrap()
+    Recipe::read(&path, &Changes::values(&BESIDE_A_BASELINE)).unwrap()
 }
 
 #[test]
@@ -259,7 +259,7 @@ fn a_baseline_asks_for_its_stage() {
     let again = Recipe { stages: beside_a_baseline(dir.path()).stages.into_iter().rev().collect(), ..beside_a_baseline(dir.path()) };
     let path = dir.path().join("again.toml");
     fs::write(&path, again.to_toml()).unwrap();
-    assert!(Recipe::read(&path, &[], None).unwrap_err().to_string().contains("stages"));
+    assert!(Recipe::read(&path, &Changes::default()).unwrap_err().to_string().contains("stages"));
 }
 
 /// A learning rate that makes the loss NaN: the run ends with one error, and the state of the last checkpoint is still there.
@@ -362,7 +362,7 @@ fn shipped_recipes_are_right() {
     for entry in fs::read_dir("models").unwrap() {
         let path: PathBuf = entry.unwrap().path().join("recipe.toml");
         if path.exists() {
-            Recipe::read(&path, &[], None).unwrap_or_else(|error| panic!("{error}"));
+            Recipe::read(&path, &Changes::default()).unwrap_or_else(|error| panic!("{error}"));
             count += 1;
         }
     }

@@ -6,8 +6,11 @@ use ada_diffuser::model::{
     agent::{Act, Agent, Episode, Observation, Start},
     config::{ModelConfig, Restart},
     critic::{Given, Sizes, Value},
-    method::{Actions, Backbone, Baseline, GruLatent, Looks},
+    method::{
+        Actions, Backbone, Baseline, Diffused, GruLatent, Guide, Head, History, Inverse, LatentSource, Looks, Target, Told, TrueFuture,
+    },
     nn::{Activations, Buffer, Params, Traced, gradient},
+    normalizer::Affine,
     options::{LatentMode, SamplerOptions},
     trajectory::Layout,
 };
@@ -45,6 +48,11 @@ fn asked_during(work: impl FnOnce()) -> usize {
 }
 
 fn agent(latent: GruLatent, backbone: Backbone, obs_horizon: usize) -> Agent {
+    agent_with(latent, backbone, obs_horizon, |_| {})
+}
+
+/// The same, changed.
+fn agent_with(latent: GruLatent, backbone: Backbone, obs_horizon: usize, change: impl FnOnce(&mut ModelConfig)) -> Agent {
     let running = latent.looks == Looks::Running;
     let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, Some(latent), backbone);
     config.method.plan.obs_horizon = obs_horizon;
@@ -54,6 +62,8 @@ fn agent(latent: GruLatent, backbone: Backbone, obs_horizon: usize) -> Agent {
     }
     // Every warm act is noised again a little.
     config.defaults.restart = Restart { renoise_distance: 0.0, cold_distance: 1e7, latent_jump: f32::INFINITY, ..Restart::default() };
+    change(&mut config);
+    config.check().unwrap();
     let networks = frozen(|params| Networks::new(config.layout, &config.method, params).unwrap());
     Agent::new(config, networks, "test".into())
 }
@@ -80,7 +90,7 @@ fn go_down(agent: &Agent, acts: &mut Vec<Act>) {
 
 #[test]
 fn a_tick_allocates_nothing() {
-    let (unet, dit) = (Backbone::Unet { widths: vec![8, 16, 16] }, Backbone::Dit { width: 16, depth: 2, heads: 2 });
+    let (unet, dit) = (Backbone::Unet { widths: vec![8, 16, 16] }, Backbone::dit(16, 2, 2));
     let block = GruLatent::plain(5, 16, Looks::Block(4));
     let surprised = GruLatent { baseline: Some(Baseline { width: 7 }), stays: 2, ..block.clone() };
     let running = GruLatent { looks: Looks::Running, actions: Actions::Unseen, ..surprised.clone() };
@@ -110,6 +120,55 @@ fn a_tick_allocates_nothing() {
     }
 }
 
+/// Guided, in the future too, with candidates, told, several rows at once; of states alone; of an oracle.
+#[test]
+fn ticks_of_other_methods_allocate_nothing() {
+    let (unet, latent) = (Backbone::Unet { widths: vec![8, 16] }, GruLatent::plain(5, 16, Looks::Block(4)));
+    let tokens = Backbone::Dit { width: 16, depth: 2, heads: 2, history: History::Tokens };
+    let guided = |guide: Guide| {
+        agent_with(latent.clone(), unet.clone(), 1, |config| {
+            (config.method.guide, config.units.returns) = (Some(guide), Some(Affine::identity(1)));
+        })
+    };
+    let of_states = agent_with(latent.clone(), tokens, 3, |config| {
+        config.method.plan.diffused = Diffused::State;
+        config.method.plan.target = Target::Eps;
+        config.method.head = Head::Inverse { network: Inverse::Diffusion { width: 8, steps: 3 }, latent: true };
+        (config.method.told, config.units.returns) = (vec![Told::Return], Some(Affine::identity(1)));
+        config.trained.action_horizons = (1..=7).collect();
+    });
+    let oracle = agent_with(latent.clone(), unet.clone(), 1, |config| {
+        config.method.latent = LatentSource::Truth { dim: 2, future: TrueFuture::Known };
+        config.units.context = Some(Affine::identity(2));
+    });
+    for (agent, judged, told, context) in [
+        (guided(Guide::Value { widths: vec![8, 16] }), true, false, None),
+        (guided(Guide::DecoderReturn), true, false, None),
+        (of_states, false, true, None),
+        (oracle, false, false, Some(vec![vec![0.3, 0.4]])),
+    ] {
+        let options = |i: usize| SamplerOptions {
+            eta: 1.0,
+            action_horizon: 1 + i % 3,
+            streaming: false,
+            guidance_scale: if judged { i as f32 } else { 0.0 },
+            guidance_samples: if judged && i > 0 { i % 3 } else { 0 },
+            candidates: if judged { 1 + i % 4 } else { 1 },
+            pick_temperature: (i % 2) as f32,
+            told_return: (told && !i.is_multiple_of(3)).then_some(0.5),
+            free_guidance_scale: if told && !i.is_multiple_of(3) { i as f32 } else { 1.0 },
+            picard_window: 1 + i % 3,
+            ..SamplerOptions::default()
+        };
+        let episodes: Vec<Episode> = (0..8).map(|i| agent.open(i as u64, &options(i)).unwrap()).collect();
+        let observation = Observation { state: vec![0.3, -0.2, 0.1], context, ..Observation::default() };
+        let acts = || episodes.iter().map(|episode| agent.begin(episode, &observation).unwrap()).collect::<Vec<_>>();
+        assert!(asked_during(|| go_down(&agent, &mut acts())) > 0, "the counter counts");
+        let mut again = acts();
+        assert_eq!(asked_during(|| go_down(&agent, &mut again)), 0, "{:?}", agent.config().method);
+    }
+}
+
 /// A network on a window and latents.
 type Run<'a> = &'a dyn Fn([Traced; 2], &[f32]) -> candle_core::Result<Traced>;
 
@@ -122,14 +181,14 @@ fn a_gradient_allocates_nothing() {
         frozen(move |params| Networks::new(config.layout, &config.method, &params.with_way_back()).unwrap())
     };
     let unet = networks(Backbone::Unet { widths: vec![8, 16, 16] });
-    let dit = networks(Backbone::Dit { width: 16, depth: 2, heads: 2 });
+    let dit = networks(Backbone::dit(16, 2, 2));
     let sizes = Sizes { columns: 5, latent_dim: 5, horizon: 8, widths: &[8, 16] };
     let value = frozen(|params| Value::new(sizes, 40, &params.with_way_back()).unwrap());
     let denoise = |networks: &Networks, x: Traced, latents: &Traced, levels: &[f32]| {
-        networks.denoiser.predict(&x, &Given { levels, latents: Some(latents), observed: None })
+        networks.denoiser.predict(&x, &Given { levels, latents: Some(latents), observed: None, told: None })
     };
     let runs: [Run; 3] = [
-        &|[x, latents], levels| value.predict(&x, &Given { levels, latents: Some(&latents), observed: None }),
+        &|[x, latents], levels| value.predict(&x, &Given { levels, latents: Some(&latents), observed: None, told: None }),
         &|[x, latents], levels| denoise(&unet, x, &latents, levels),
         &|[x, latents], levels| denoise(&dit, x, &latents, levels),
     ];

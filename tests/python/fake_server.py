@@ -1,7 +1,7 @@
 """A double of the server for faults that a real one shows only by chance: the step protocol and both faces, small.
 
 An act's actions are `step + executed rewards`, so a test sees what arrived; its latent is the number of acts of earlier episodes that it
-looks back on, and a half. Faults are scripted: each act takes the next one.
+looks back on, and a half; with a guide its value is minus its step. Faults are scripted: each act takes the next one.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import grpc
+import numpy as np
 
 from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
 
@@ -61,6 +62,10 @@ class Core:
     #: Acts that a batch may hold, and the length of each batch that arrived.
     batch_len_max: int = 256
     batches: list[int] = field(default_factory=list)
+    #: What the model says of itself beyond `MODEL`.
+    traits: dict = field(default_factory=dict)
+    #: Options of each session that was opened, as the face has them.
+    options: list[object] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def open(self) -> str:
@@ -112,9 +117,11 @@ MODEL = {
 }
 
 
-def _chunk(name: str, step: int, action: list[float], replayed: bool, kept: int) -> dict:
-    timings = {"queue_us": 1, "compute_us": 2, "commit_us": 3, "total_us": 6}
+def _chunk(core: Core, name: str, step: int, action: list[float], replayed: bool) -> dict:
+    timings, kept = {"queue_us": 1, "compute_us": 2, "commit_us": 3, "total_us": 6}, core.sessions[name].kept
     return {
+        **({"value": -float(step), "value_spread": 0.5} if core.traits.get("guide") else {}),
+        "passes": 2,
         **{"session_id": name, "step": step, "replayed": replayed, "actions": [action, action, action]},
         **{"latent_mean": [kept + 0.5], "latent_log_var": [-1.0], "predicted_state": [0.0, 0.0], "evaluations": 3},
         **{"start": "warm", "renoised_rungs": 0, "timings": timings, "model": "fake", "model_digest": "0" * 64, "degraded": False},
@@ -134,11 +141,12 @@ class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
         self.core = core
 
     def List(self, request, context):  # noqa: N802
-        return models_pb2.ListModelsResponse(models=[_model()])
+        return models_pb2.ListModelsResponse(models=[_model(self.core)])
 
     def OpenSession(self, request, context):  # noqa: N802
-        session = agent_pb2.Session(session_id=self.core.open(), seed=request.seed)
-        return agent_pb2.OpenSessionResponse(session=session, model=_model())
+        self.core.options.append(request.options)
+        session = agent_pb2.Session(session_id=self.core.open(), seed=request.seed, options=request.options)
+        return agent_pb2.OpenSessionResponse(session=session, model=_model(self.core))
 
     def ResetSession(self, request, context):  # noqa: N802
         try:
@@ -193,14 +201,28 @@ class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
     def _act(self, request):
         executed = [{"reward": done.reward} if done.HasField("reward") else {} for done in request.observation.executed]
         observation = {"state": list(request.observation.state), "executed": executed}
+        if request.observation.HasField("context"):
+            told = request.observation.context
+            observation["context"] = [list(told.values[row * told.columns :][: told.columns]) for row in range(told.rows)]
         action, replayed = self.core.act(request.session_id, request.step, observation)
-        chunk = _chunk(request.session_id, request.step, action, replayed, self.core.sessions[request.session_id].kept)
+        chunk = _chunk(self.core, request.session_id, request.step, action, replayed)
         actions = agent_pb2.Matrix(values=action * 3, rows=3, columns=2)
         return agent_pb2.ActResponse(**{**chunk, "actions": actions, "start": "START_WARM"})
 
 
-def _model() -> models_pb2.Model:
-    return models_pb2.Model(**{**MODEL, "sampler": models_pb2.SamplerOptions(kappa=1.0, latent="LATENT_MODE_MEAN")})
+def _model(core: Core) -> models_pb2.Model:
+    told = [{**one, "kind": f"TOLD_KIND_{one['kind'].upper()}"} for one in core.traits.get("told", [])]
+    special = {"sampler": models_pb2.SamplerOptions(kappa=1.0, latent="LATENT_MODE_MEAN"), "told": told}
+    if context := core.traits.get("context"):
+        special["context"] = {**context, "future": f"TRUE_FUTURE_{context['future'].upper()}"}
+    return models_pb2.Model(**{**MODEL, **core.traits, **special})
+
+
+def _in_few_digits(value: object) -> object:
+    """As a server in float32 spells it: in as many digits as tell it there."""
+    if isinstance(value, list):
+        return [_in_few_digits(one) for one in value]
+    return float(str(np.float32(value))) if isinstance(value, float) else value
 
 
 class HttpFake(BaseHTTPRequestHandler):
@@ -211,7 +233,7 @@ class HttpFake(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self.path == "/v1/models":
-            return self._answer(200, {"models": [MODEL]})
+            return self._answer(200, {"models": [{**MODEL, **self.core.traits}]})
         name = self.path.split("/")[3]
         return self._answer(200, {"session": _session(name, self.core.sessions[name].committed)})
 
@@ -222,7 +244,11 @@ class HttpFake(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         if self.path == "/v1/sessions":
-            return self._answer(201, {"session": _session(self.core.open(), 0), "model": MODEL})
+            options = body.get("options", {})
+            self.core.options.append(options)
+            session = _session(self.core.open(), 0)
+            session["options"] |= {name: _in_few_digits(value) for name, value in options.items()}
+            return self._answer(201, {"session": session, "model": {**MODEL, **self.core.traits}})
         if self.path == "/v1/act:batch":
             try:
                 self.core.batch(len(body["acts"]))
@@ -246,7 +272,7 @@ class HttpFake(BaseHTTPRequestHandler):
         except Refusal as refusal:
             facts = {name: value for name, value in vars(refusal).items() if value not in (None, "")}
             return {**known, "error": {"status": CODES[refusal.reason][1], "detail": "refused", **facts}}
-        return {**known, "response": _chunk(act["session_id"], act["step"], action, replayed, self.core.sessions[act["session_id"]].kept)}
+        return {**known, "response": _chunk(self.core, act["session_id"], act["step"], action, replayed)}
 
     def _answer(self, status: int, body: dict | None) -> None:
         text = b"" if body is None else json.dumps(body).encode()

@@ -34,6 +34,7 @@ from ada_diffuser import (
 )
 from ada_diffuser.commands import evaluate as evaluate_command
 from ada_diffuser.commands import rollout as rollout_command
+from ada_diffuser.options import KINDS
 from ada_diffuser.rollout import Trial, evaluate
 
 FACES = ("grpc", "http")
@@ -125,7 +126,8 @@ def test_what_a_client_must_know(client: Client) -> None:
     assert tiny.name == "tiny" and tiny.is_default and len(tiny.digest) == 64
     assert client.model().digest == client.model(f"tiny@{tiny.digest[:8]}").digest == tiny.digest
     assert len(tiny.action_low) == len(tiny.action_high) == tiny.action_dim
-    assert len(tiny.sampler.given()) == 7, "every default is said"
+    assert set(KINDS) - set(tiny.sampler.given()) == {"told_return", "told_goal"}, "every default is said, and nothing is told"
+    assert (tiny.told, tiny.returns, tiny.guide, tiny.context) == ((), None, False, None)
     assert tiny.sampler.action_horizon in tiny.trained.action_horizons and tiny.trained.missing.reward
     wanted = SamplerOptions(streaming=False, temperature=0.5, latent="sample", kappa=0.0)
     with client.open_session(seed=2**53 - 1, options=wanted, ttl_ms=60_000) as session:
@@ -143,6 +145,15 @@ def test_what_a_client_must_know(client: Client) -> None:
         assert again.act(STATES[1]).step == 2
     with pytest.raises(NotFound):
         client.summary(session.session_id)
+
+
+def test_rows_at_once_are_told_apart_from_forwards(client: Client) -> None:
+    with client.open_session(seed=5, options=SamplerOptions(streaming=False)) as session:
+        one_by_one = session.act(STATES[0])
+    with client.open_session(seed=5, options=SamplerOptions(streaming=False, picard_window=4)) as session:
+        at_once = session.act(STATES[0])
+    assert one_by_one.passes == one_by_one.evaluations == 8 and at_once.passes <= 8 < at_once.evaluations
+    assert at_once.value is None and at_once.value_spread is None
 
 
 @pytest.mark.parametrize("face", FACES)
@@ -247,6 +258,13 @@ def test_a_reset_is_a_new_session(client: Client) -> None:
         assert kept.latent_mean.tobytes() != first[0][1], "the latent still looks back on the old episode"
 
 
+WRONG_OPTIONS = (
+    *(SamplerOptions(action_horizon=10_000), SamplerOptions(kappa=-1.0), SamplerOptions(sub_steps=0)),
+    *(SamplerOptions(guidance_scale=1.0), SamplerOptions(candidates=2, streaming=False), SamplerOptions(picard_window=0)),
+    *(SamplerOptions(told_return=1.0), SamplerOptions(told_goal=(0.5, 0.5)), SamplerOptions(free_guidance_scale=2.0)),
+)
+
+
 def test_wrong_input_is_named_alike_by_both_faces(address: str) -> None:
     def complaints(face: str) -> list[tuple[str, str, str]]:
         told = []
@@ -260,7 +278,10 @@ def test_wrong_input_is_named_alike_by_both_faces(address: str) -> None:
                 with pytest.raises(InvalidInput) as caught:
                     session.act(state, executed)
                 told.append((caught.value.reason, caught.value.field, caught.value.message))
-            for options in (SamplerOptions(action_horizon=10_000), SamplerOptions(kappa=-1.0), SamplerOptions(sub_steps=0)):
+            with pytest.raises(InvalidInput) as caught:
+                session.act([0.0] * 4, context=[[0.0, 0.0]])
+            told.append((caught.value.reason, caught.value.field, caught.value.message))
+            for options in WRONG_OPTIONS:
                 with pytest.raises(InvalidInput) as caught:
                     client.open_session(options=options)
                 told.append((caught.value.reason, caught.value.field, caught.value.message))
@@ -282,11 +303,11 @@ def test_wrong_input_is_named_alike_by_both_faces(address: str) -> None:
     by_grpc, by_http = (complaints(face) for face in FACES)
     assert by_grpc == by_http
     assert [reason for reason, _, _ in by_grpc] == [
-        *("OBSERVATION_INVALID",) * 3,
-        *("OPTIONS_INVALID",) * 3,
+        *("OBSERVATION_INVALID",) * 4,
+        *("OPTIONS_INVALID",) * len(WRONG_OPTIONS),
         *("MODEL_NOT_FOUND", "STEP_OUT_OF_ORDER", "SESSION_NOT_FOUND"),
     ]
-    assert by_grpc[1][1] == "observation.executed[0].action"
+    assert (by_grpc[1][1], by_grpc[3][1]) == ("observation.executed[0].action", "observation.context")
 
 
 def test_rollouts_are_the_same_by_both_faces_alone_and_in_a_batch(address: str) -> None:

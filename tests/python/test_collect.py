@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import subprocess
@@ -17,7 +18,7 @@ from server import descendants, gone
 from ada_diffuser import environments
 from ada_diffuser.collect import Job, collect
 from ada_diffuser.commands.collect import main
-from ada_diffuser.dataset import card_path, load_episodes
+from ada_diffuser.dataset import card_path, load_episodes, with_play
 from ada_diffuser.experts import formula_of, load_expert
 from ada_diffuser.experts.policy import CalledExpert
 
@@ -308,6 +309,24 @@ def test_an_expert_of_another_shape_is_refused(tmp_path, capsys):
     expert = tmp_path / "x.expert.npz"
     assert run(tmp_path / "y.h5", "--env", "point-wind-s", "--expert", str(expert)) == 2
     assert "expert" in capsys.readouterr().err
+
+
+def test_other_data_sets_go_behind_as_play(tmp_path):
+    """Pooled data of other gains, of which a planner imitates the first alone; what differs in columns is refused."""
+    other, pooled = tmp_path / "other.h5", tmp_path / "pooled.h5"
+    assert run(other, "--env", "point-wind-s", "--episodes", "2", "--seed", "5") == 0
+    assert run(pooled, "--env", "point-wind-s", "--also", str(other)) == 0
+    found, behind = load_episodes(pooled), load_episodes(other)
+    rows = len(behind.rewards)
+    assert not found.play[:-rows].any() and found.play[-rows:].all()
+    assert np.array_equal(found.observations[-rows:], behind.observations) and len(found.returns()) == 5
+    assert json.loads(card_path(pooled).read_text())["also"] == {"other.h5": {"episodes": 2, "steps": rows}}
+    wrong = dataclasses.replace(behind, context=behind.context[:, :1])
+    with pytest.raises(ValueError, match=r"infos/context of \(2,\) and \(1,\) columns do not go together"):
+        with_play(behind, [wrong])
+    sessions = [dataclasses.replace(behind, session=np.repeat([0, 1], rows // 2)) for _ in range(2)]
+    assert list(np.unique(with_play(sessions[0], sessions[1:]).session)) == [0, 1, 2, 3]
+    assert main(["--out", str(pooled), "--env", "point-wind-s", "--quiet", "--also", str(tmp_path / "none.h5")]) == 2
 
 
 def test_a_search_that_is_killed_leaves_no_process(tmp_path: Path) -> None:

@@ -21,6 +21,8 @@ from jsonschema import Draft202012Validator
 from openapi_spec_validator import OpenAPIV31SpecValidator
 from server import running
 
+from ada_diffuser.options import KINDS
+
 STATE = [0.1, -0.2, 0.3, 0.4]
 
 
@@ -50,6 +52,12 @@ def call(address: str, method: str, path: str, body: object = None) -> tuple[int
 
 def test_it_is_valid(spec: dict[str, Any]) -> None:
     assert [error.message for error in OpenAPIV31SpecValidator(spec).iter_errors()] == []
+
+
+def test_it_names_every_option(spec: dict[str, Any]) -> None:
+    schemas = spec["components"]["schemas"]
+    assert set(schemas["OptionsBody"]["properties"]) == set(KINDS)
+    assert schemas["ObservationBody"]["properties"]["context"]["items"]["items"]["type"] == "number"
 
 
 def test_answers_fit_their_schemas(address: str, spec: dict[str, Any]) -> None:

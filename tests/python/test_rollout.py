@@ -65,6 +65,15 @@ def test_statistics() -> None:
     assert stored["options"]["kappa"] == "infinity"
 
 
+def test_what_acts_cost_and_were_worth_is_kept_when_episodes_are_joined() -> None:
+    one = ActLog([1.0], 2, 0, 9, [Timings(1, 2, 3, 6)], 4, [-1.0])
+    both = one.joined(ActLog([2.0], 1, 1, 3, [Timings(4, 5, 6, 15)], 3, [-4.0, -7.0]))
+    assert (both.acts, both.replayed, both.evaluations, both.passes, both.values) == (3, 1, 12, 7, [-1.0, -4.0, -7.0])
+    result = replace(finished("point-wind-s", [Episode(0, rewards=[-1.0])]), acts=both)
+    assert result.mean_value == -4.0 and result.passes_per_act == pytest.approx(7 / 3)
+    assert finished("point-wind-s", [Episode(0, rewards=[-1.0])]).mean_value is None
+
+
 def test_the_readout_finds_a_linear_context_and_nothing_in_noise() -> None:
     episodes = [played("cheetah-wind-s", seed) for seed in range(4)]
     read = fit(episodes)

@@ -177,7 +177,7 @@ def test_a_changed_key_does_that_cell_again_and_no_other(done: Place, tmp_path: 
 
 
 def test_a_failing_cell_is_told_at_the_end_and_the_others_go_on(done: Place, tmp_path: Path) -> None:
-    lilac = '\n[methods.lilac]\nrecipe = "models/{environment}/lilac.toml"\nmodes = ["cold"]\n'
+    lilac = '\n[methods.lilac]\nwith = ["models/methods/lilac.toml"]\nmodes = ["cold"]\n'
     place = done.copy(tmp_path / "place", TINY.replace("\n[methods.diffuser]", f"{lilac}\n[methods.diffuser]"))
     (place.folder / "report/cells/tiny/point-wind-s/diffuser/seed0-cold.json").unlink()
     told = place.run("--jobs", "1", "--json")
@@ -214,6 +214,8 @@ def refused(folder: Path, text: str, capsys: pytest.CaptureFixture[str]) -> str:
         ("collect = { episodes = 24 }", "data = 'x.h5'", "environments.point-wind-s.data: there is no x.h5; say how it is made"),
         ("[methods.ours]\nrecipe", "[methods.ours]\nreceipt", "methods.ours.recipe is missing"),
         ("models/{environment}/recipe.toml", "models/nowhere.toml", "methods.ours.recipe: models/nowhere.toml"),
+        ("models/methods/diffuser.toml", "models/methods/none.toml", "methods.diffuser.with: models/methods/none.toml"),
+        ('\nrecipe = "models/point-wind-s/recipe.toml"', "", "methods.diffuser.recipe must be given: no environment has one of its own"),
         ('"models/{environment}/recipe.toml"', "{ mars = 'x' }", "methods.ours.recipe.mars is of no environment"),
         ('"checkpoint_every=20"', '"checkpoint_every"', "methods.ours.set has 'checkpoint_every', which is not KEY=VALUE"),
         ("[methods.diffuser]", "vary = { x = 1 }\n[methods.diffuser]", "methods.ours.vary.x must be a list of values"),

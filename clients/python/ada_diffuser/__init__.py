@@ -26,10 +26,13 @@ from ada_diffuser.messages import (
     Missing,
     Model,
     Observation,
+    Returns,
     SamplerOptions,
     SessionSummary,
     Timings,
+    Told,
     Trained,
+    TrueContext,
 )
 from ada_diffuser.retry import RetryPolicy
 
@@ -51,6 +54,7 @@ __all__ = [
     "Overloaded",
     "PayloadMismatch",
     "RetryPolicy",
+    "Returns",
     "SamplerOptions",
     "ServerFault",
     "Session",
@@ -58,8 +62,10 @@ __all__ = [
     "SessionSummary",
     "StepConflict",
     "Timings",
+    "Told",
     "TooLarge",
     "Trained",
+    "TrueContext",
     "Unavailable",
     "UnexpectedAnswer",
 ]

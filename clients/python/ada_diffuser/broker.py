@@ -20,6 +20,8 @@ from ada_diffuser.values import Floats, number, vector
 class ChunkBroker:
     """Hands out the actions of a session's chunks one by one.
 
+    An oracle (`session.model.context`) is told the true `context` with each observation.
+
     With many simulators in lockstep, call `due`, `observation` and `accept` around `Client.act_batch` instead of `action`:
 
         due = [(b, s) for b, s in zip(brokers, states) if b.due]
@@ -38,16 +40,16 @@ class ChunkBroker:
         """Whether the next action needs an act."""
         return self.chunk is None or self._next >= len(self.chunk.actions)
 
-    def action(self, state: ArrayLike) -> Floats:
-        """The action for this state, `(action_dim,)`; acts if it is due."""
+    def action(self, state: ArrayLike, *, context: ArrayLike | None = None) -> Floats:
+        """The action for this state, `(action_dim,)`; acts if it is due, and only then looks at `context`."""
         if self.due:
-            observation = self.observation(state)
-            self.accept(self.session.act(observation.state, observation.executed, nothing_executed=observation.nothing_executed))
+            seen = self.observation(state, context=context)
+            self.accept(self.session.act(seen.state, seen.executed, nothing_executed=seen.nothing_executed, context=seen.context))
         return self.take(state)
 
-    def observation(self, state: ArrayLike) -> Observation:
+    def observation(self, state: ArrayLike, *, context: ArrayLike | None = None) -> Observation:
         """What an act at this state has to tell."""
-        return Observation(state, tuple(self._executed), nothing_executed=self.chunk is not None and not self._executed)
+        return Observation(state, tuple(self._executed), self.chunk is not None and not self._executed, context)
 
     def accept(self, chunk: Chunk) -> None:
         """The answer of the act that was due."""

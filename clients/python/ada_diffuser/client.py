@@ -38,7 +38,7 @@ from ada_diffuser.messages import (
     executed_values,
 )
 from ada_diffuser.retry import Backoff, RetryPolicy
-from ada_diffuser.values import column, flag, invalid, text, vector, whole
+from ada_diffuser.values import column, flag, invalid, matrix, text, vector, whole
 
 T = TypeVar("T")
 
@@ -339,6 +339,7 @@ class Session:
         *,
         reward: ArrayLike | None = None,
         nothing_executed: bool = False,
+        context: ArrayLike | None = None,
         deadline_ms: int | None = None,
         planned_states: bool = False,
     ) -> Chunk:
@@ -347,12 +348,13 @@ class Session:
         `state` is the current state, `(state_dim,)`. `executed` says what was executed since the last act; empty means the
         whole last chunk. `reward` is short for it when only rewards are to be told: one for each step executed since.
         `nothing_executed` plans anew in the place of the last act: none of its actions was executed, and no time has passed.
+        `context` is what an oracle is told, `(steps, dim)`, see `Observation.context`.
         """
         if reward is not None:
             if len(executed):
                 raise ValueError("rewards stand in `executed` when it is given")
             executed = _rewarded(reward)
-        call = self.next_call(Observation(state, executed, nothing_executed), deadline_ms, planned_states)
+        call = self.next_call(Observation(state, executed, nothing_executed, context), deadline_ms, planned_states)
         chunk = self._client._act(call)
         self.commit(chunk)
         return chunk
@@ -368,6 +370,7 @@ class Session:
             nothing_executed=flag(observation.nothing_executed, "observation.nothing_executed"),
             deadline_ms=_whole_if_given(deadline_ms, "deadline_ms", bits=32),
             want_planned_states=flag(planned_states, "want_planned_states"),
+            context=None if observation.context is None else matrix(observation.context, "observation.context"),
         )
 
     def commit(self, chunk: Chunk) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,30 @@ def load_episodes(path: Path) -> Episodes:
     with h5py.File(path, "r") as file:
         present = {name: path for name, path in _PATHS.items() if name not in _OPTIONAL or path in file}
         return Episodes(**{name: file[path][()] for name, path in present.items()})
+
+
+def with_play(own: Episodes, others: Sequence[Episodes]) -> Episodes:
+    """The episodes of several data sets, of which those of the others are play: a latent learns from them, no planner imitates them.
+
+    Raises `ValueError` if they do not have the same columns. Sessions are numbered on.
+    """
+    parts = [own, *(replace(other, play=np.ones(len(other.rewards), bool)) for other in others)]
+    columns: dict[str, np.ndarray | None] = {}
+    for name in _PATHS:
+        found = [getattr(part, name) for part in parts]
+        if name in ("play", "blind"):
+            found = [np.zeros(len(part.rewards), bool) if column is None else column for part, column in zip(parts, found, strict=True)]
+        told = [column for column in found if column is not None]
+        if told and (len(told) < len(found) or len({column.shape[1:] for column in told}) > 1):
+            shapes = " and ".join("none" if column is None else str(column.shape[1:]) for column in found)
+            raise ValueError(f"data sets with {_PATHS[name]} of {shapes} columns do not go together")
+        if name == "session" and told:
+            counts = np.cumsum([0, *(column.max() + 1 for column in told[:-1])])
+            told = [column + first for column, first in zip(told, counts, strict=True)]
+        columns[name] = np.concatenate(told) if told else None
+    if not columns["blind"].any():  # type: ignore[union-attr]
+        columns["blind"] = own.blind
+    return Episodes(**columns)  # type: ignore[arg-type]
 
 
 def card_path(path: Path) -> Path:

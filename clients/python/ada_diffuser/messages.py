@@ -5,100 +5,36 @@ Values are in the units of the data set and travel as float32.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import partial
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 from numpy.typing import ArrayLike
 
-from ada_diffuser.values import Floats, flag, invalid, number, text, vector, whole
+from ada_diffuser.options import LatentMode, SamplerOptions
+from ada_diffuser.values import Floats, invalid, number, vector
 
-LatentMode = Literal["mean", "sample"]
+__all__ = [
+    "ActCall",
+    "Chunk",
+    "Executed",
+    "ExecutedValues",
+    "LatentMode",
+    "Missing",
+    "Model",
+    "Observation",
+    "Returns",
+    "SamplerOptions",
+    "SessionSummary",
+    "Start",
+    "Timings",
+    "Told",
+    "Trained",
+    "TrueContext",
+    "executed_values",
+]
+
 Start = Literal["cold", "warm", "renoised"]
-
-
-@dataclass(frozen=True)
-class SamplerOptions:
-    """How a chunk is sampled. In a request None means the model's default; in an answer every field is set."""
-
-    #: Keep the partly denoised window between acts.
-    streaming: bool | None = None
-    #: Actions that one act returns.
-    action_horizon: int | None = None
-    #: Sub-steps per rung of the ladder.
-    sub_steps: int | None = None
-    #: 0 is DDIM, 1 is DDPM.
-    eta: float | None = None
-    #: Factor on the standard deviation of all noise.
-    temperature: float | None = None
-    #: Trust region of the zig-zag refinement in nats: 0 is off, infinity is as in the paper.
-    kappa: float | None = None
-    #: Whether latents are drawn or their means are used.
-    latent: LatentMode | None = None
-
-    @classmethod
-    def parse(cls, words: Mapping[str, str]) -> SamplerOptions:
-        """From text, as a command line has it: `{"streaming": "false", "kappa": "inf"}`. ValueError names the wrong one."""
-        unknown = set(words) - set(_PARSERS)
-        if unknown:
-            raise ValueError(f"no such option: {', '.join(sorted(unknown))}; there are {', '.join(_PARSERS)}")
-        values: dict[str, Any] = {}
-        for name, word in words.items():
-            try:
-                values[name] = _PARSERS[name](word)
-            except ValueError as error:
-                raise ValueError(f"option {name}: {error}") from None
-        return cls(**values)
-
-    def given(self) -> dict[str, Any]:
-        """The fields that are set."""
-        pairs = ((item.name, getattr(self, item.name)) for item in fields(self))
-        return {name: value for name, value in pairs if value is not None}
-
-    def checked(self) -> SamplerOptions:
-        """With plain numbers and flags, as they travel; InvalidInput names the wrong one."""
-        return replace(self, **{name: _CHECKS[name](value, f"options.{name}") for name, value in self.given().items()})
-
-
-def _flag(word: str) -> bool:
-    if word.lower() not in ("true", "false"):
-        raise ValueError(f"{word!r} is neither true nor false")
-    return word.lower() == "true"
-
-
-def _latent_mode(word: str) -> str:
-    if word not in ("mean", "sample"):
-        raise ValueError(f"{word!r} is neither mean nor sample")
-    return word
-
-
-_PARSERS: dict[str, Any] = {
-    "streaming": _flag,
-    "action_horizon": int,
-    "sub_steps": int,
-    "eta": float,
-    "temperature": float,
-    "kappa": float,
-    "latent": _latent_mode,
-}
-
-
-def _checked_mode(value: Any, field: str) -> str:
-    if text(value, field) not in ("mean", "sample"):
-        raise invalid(field, f"{value!r} is neither mean nor sample")
-    return str(value)
-
-
-_CHECKS: dict[str, Callable[[Any, str], Any]] = {
-    "streaming": flag,
-    "action_horizon": partial(whole, bits=32),
-    "sub_steps": partial(whole, bits=32),
-    "eta": number,
-    "temperature": number,
-    "kappa": partial(number, infinity=True),
-    "latent": _checked_mode,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +60,9 @@ class Observation:
     executed: Sequence[Executed] = ()
     #: Nothing of the last chunk was executed and no time has passed: this act takes its place. Excludes `executed`.
     nothing_executed: bool = False
+    #: The true context of now and of the steps to come, `(steps, dim)`, or of now alone, `(dim,)`: for an oracle, which cannot act without
+    #: (`Model.context`); any other model takes none.
+    context: ArrayLike | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +87,8 @@ class ActCall:
     nothing_executed: bool = False
     deadline_ms: int | None = None
     want_planned_states: bool = False
+    #: `(steps, dim)`.
+    context: Floats | None = None
 
 
 def executed_values(executed: Sequence[Executed]) -> tuple[ExecutedValues, ...]:
@@ -192,7 +133,7 @@ class Chunk:
     latent_log_var: Floats
     #: Predicted state after the chunk's last action, `(state_dim,)`.
     predicted_state: Floats
-    #: Denoiser evaluations that the act took.
+    #: Windows that the denoiser evaluated.
     evaluations: int
     start: Start
     renoised_rungs: int
@@ -200,6 +141,12 @@ class Chunk:
     model: str
     model_digest: str
     degraded: bool
+    #: Forwards of the denoiser that the act took part in, one after the other: fewer, where several rows are evaluated at once.
+    passes: int = 0
+    #: What the guide holds the plan to be worth: the discounted mean of the rewards to come. None where it neither led nor chose it.
+    value: float | None = None
+    #: Standard deviation of that over the candidates.
+    value_spread: float | None = None
 
 
 @dataclass(frozen=True)
@@ -224,6 +171,35 @@ class Trained:
     sessions: bool = False
 
 
+@dataclass(frozen=True)
+class Told:
+    """Something that a session may tell of what it wants: `SamplerOptions.told_return` or `told_goal`."""
+
+    kind: Literal["return", "goal"]
+    #: With a goal: the columns of the state that are meant, in the order of its values.
+    columns: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Returns:
+    """How large the data's returns are, the discounted means of the rewards to come."""
+
+    mean: float
+    #: Standard deviation.
+    std: float
+
+
+@dataclass(frozen=True)
+class TrueContext:
+    """The true context, as an oracle has to be told it in `Observation.context`."""
+
+    #: Values of each row.
+    dim: int
+    #: `held`: one row, that of now, which holds for all of the window; `known`: those of the steps to come as well, 1 to
+    #: `plan_horizon + action_horizon - 1` rows, of which the last holds for what comes then.
+    future: Literal["held", "known"]
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """What a client must know of a model."""
@@ -245,6 +221,15 @@ class Model:
     #: Whether it was trained with zig-zag refinement; without it `kappa` other than 0 is refused.
     refined: bool
     trained: Trained
+    #: What a session may tell of what it wants: all of it, or nothing.
+    told: tuple[Told, ...] = ()
+    #: None where the model knows of none.
+    returns: Returns | None = None
+    #: Whether it has a guide, which leads windows (`guidance_scale`) and chooses among `candidates`, and then says what it holds them
+    #: to be worth (`Chunk.value`).
+    guide: bool = False
+    #: Of an oracle; None: it finds out by itself, or knows nothing of it, and takes no context.
+    context: TrueContext | None = None
 
 
 @dataclass(frozen=True, eq=False)

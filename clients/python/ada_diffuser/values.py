@@ -34,6 +34,18 @@ def vector(values: ArrayLike, field: str) -> Floats:
     return numbers
 
 
+def matrix(values: ArrayLike, field: str) -> Floats:
+    """A float32 matrix, `(rows, n)`, all finite; a vector is a row."""
+    numbers = _float32(_numbers(values, field), field)
+    if numbers.ndim not in (1, 2):
+        raise invalid(field, f"has {numbers.ndim} dimensions instead of 2")
+    rows = numbers.reshape(-1, numbers.shape[-1]) if numbers.ndim == 2 else numbers[None]
+    bad = np.argwhere(~np.isfinite(rows))
+    if bad.size:
+        raise invalid(f"{field}[{bad[0][0]}][{bad[0][1]}]", "is not a finite number")
+    return rows
+
+
 def column(values: ArrayLike, field: str) -> NDArray[Any]:
     """Numbers one below the other, `(n,)`: one alone, a vector, or a matrix of one column."""
     numbers = np.atleast_1d(_numbers(values, field))

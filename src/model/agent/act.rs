@@ -2,10 +2,12 @@
 //! paper). It works on a copy of the episode: dropping it leaves the old one standing.
 
 use super::{
-    AgentError, Chunk, Episode, Start,
+    AgentError, Ask, Chunk, Episode, Start,
+    candidate::Candidate,
     chain::Chain,
     episode::Planned,
     restart::{Stored, choose_start},
+    types::Known,
 };
 use crate::model::{
     config::ModelConfig,
@@ -13,118 +15,188 @@ use crate::model::{
         descent::{Descent, Sampling, Walk},
         schedule::Table,
     },
-    latent::Evidence,
+    latent::{Evidence, GaussianRef},
     noise::{Noise, Slot},
-    options::LatentMode,
+    options::{LatentMode, SamplerOptions},
     trajectory::TokenRef,
 };
 
-/// What an act asks of the networks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ask {
-    /// The latents of its window, from what was really seen; then it starts.
-    Filter,
-    /// The latent of position 0 anew, with the noised positions 0 and 1 (zig-zag).
-    Refine,
-    /// The clean window.
-    Denoise,
-}
-
-impl Ask {
-    /// In this order they are answered in one tick: an act that has its latents can be denoised at once.
-    pub const ORDER: [Self; 3] = [Self::Filter, Self::Refine, Self::Denoise];
-}
-
-/// An act in progress. All its memory is taken when it begins; its way down allocates nothing.
+/// An act in progress. All its memory is taken when it begins, and bounded where acts wait; its way down allocates nothing.
 #[derive(Debug)]
 pub struct Act {
     episode: Episode,
-    /// Whether the stored window begins at this time.
+    /// See [`Known::aligned`].
     aligned: bool,
     started: bool,
     start: Start,
-    latents: Chain,
     /// Belief of position 0 at the last cold start: a chain of one.
     anchor: Chain,
-    descent: Descent,
+    told: Vec<f32>,
+    truth: Vec<f32>,
+    candidates: Vec<Candidate>,
+    choice: Choice,
+}
+
+/// Which candidate it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Choice {
+    /// Whether there is nothing left to choose.
+    made: bool,
+    index: usize,
+    /// Its value and the spread of all, standard deviations of the data's returns.
+    worth: Option<(f32, f32)>,
 }
 
 impl Act {
-    /// An act on `episode`, which has taken note of what was executed; `state` is s_tau, normalized.
-    pub(super) fn new(episode: Episode, state: Vec<f32>, table: Table, aligned: bool, config: &ModelConfig) -> Self {
-        let (options, plan, dim) = (episode.options(), &config.method.plan, config.method.latent.dim());
-        let sampling = Sampling {
+    /// An act on `episode`, which has taken note of what was executed.
+    pub(super) fn new(episode: Episode, known: Known, table: Table, config: &ModelConfig) -> Self {
+        let (options, method) = (episode.options(), &config.method);
+        let width = method.plan.width(config.layout.widths());
+        let sampling = |index| Sampling {
             table,
             actions: options.action_horizon,
             eta: options.eta,
             temperature: options.temperature,
-            noise: Noise::new(episode.seed()),
+            noise: Noise::new(episode.seed()).of_candidate(index),
             time: episode.time(),
+            at_once: (options.picard_window, options.picard_tolerance),
         };
+        let candidate = |index| {
+            Candidate::new(
+                Descent::new(sampling(index), known.state.clone(), [method.plan.horizon, width]),
+                Chain::new(method.plan.horizon + options.action_horizon - 1, method.latent.dim()),
+                [options.action_horizon, config.layout.action_dim],
+            )
+        };
+        let Known { told, truth, aligned, .. } = &known;
         Self {
-            aligned,
+            aligned: *aligned,
             started: false,
             start: Start::Cold,
-            latents: Chain::new(plan.horizon + options.action_horizon - 1, dim),
-            anchor: Chain::new(1, dim),
-            descent: Descent::new(sampling, state, [plan.horizon, config.layout.dim()]),
+            anchor: Chain::new(1, method.latent.dim()),
+            told: told.clone(),
+            truth: truth.clone(),
+            candidates: (0..options.candidates).map(candidate).collect(),
+            choice: Choice { made: options.candidates == 1 && options.guidance_scale == 0.0, ..Choice::default() },
             episode,
         }
     }
 
-    /// Whether it asks this of the networks now.
+    /// Whether it asks this of the networks now, of itself or of one of its windows.
     pub(super) fn asks(&self, ask: Ask) -> bool {
         match ask {
             Ask::Filter => !self.started,
-            Ask::Refine => self.started && self.descent.is_ready() && self.episode.options().kappa > 0.0 && !self.latents.is_empty(),
-            Ask::Denoise => self.started && !self.is_done(),
+            Ask::Choose => self.started && !self.choice.made && self.candidates.iter().all(Candidate::is_done) && !self.has_failed(),
+            Ask::Refine | Ask::Denoise | Ask::Invert => {
+                self.started && self.candidates.iter().any(|window| window.asks(ask, self.options()))
+            }
         }
     }
 
     /// Whether the chunk is ready to be taken by [`super::Agent::finish`].
     pub fn is_done(&self) -> bool {
-        self.descent.is_done()
+        self.has_failed() || self.choice.made && self.candidates.iter().all(Candidate::is_done)
     }
 
-    /// Network evaluations spent so far.
+    fn has_failed(&self) -> bool {
+        self.candidates.iter().any(|window| window.descent().has_failed())
+    }
+
+    /// Network evaluations spent so far, of all its windows.
     pub fn evaluations(&self) -> u32 {
-        self.descent.evaluations()
+        let each = 1 + u32::from(self.options().doubts());
+        each * self.candidates.iter().map(|window| window.descent().evaluations()).sum::<u32>()
     }
 
-    /// Windows that it holds, each a row of every network evaluation it takes part in: what an engine bounds. One window an act; candidates
-    /// and a second, unconditioned window (classifier-free guidance) would be more.
+    /// Forwards that it took part in so far.
+    fn passes(&self) -> u32 {
+        self.candidates.iter().map(|window| window.descent().passes()).max().unwrap_or(0)
+    }
+
+    /// Rows that it has in the next network evaluation: what an engine bounds. One window an act; candidates, rows of the table that are
+    /// evaluated at once, and each of them without what is told (classifier-free guidance) are more.
     pub fn rows(&self) -> usize {
-        1
+        let slots = |window: &Candidate| if window.descent().is_done() { 0 } else { window.descent().slots() };
+        let windows: usize = self.candidates.iter().map(slots).sum();
+        windows.max(1) * (1 + usize::from(self.options().doubts()))
     }
 
-    /// Evaluations that it still asks for; of one that has not started those of a warm start, if there may be one.
+    /// Forwards that it still asks for; of one that has not started those of a warm start, if there may be one.
     pub fn evaluations_left(&self) -> usize {
-        match self.stored().filter(|_| !self.started) {
-            Some(stored) => self.descent.evaluations_left_from(stored.row()),
-            None => self.descent.evaluations_left(),
-        }
+        let left = |window: &Candidate| match self.stored().filter(|_| !self.started) {
+            Some(stored) => window.descent().rows_left(stored.row()),
+            None => window.descent().evaluations_left(),
+        };
+        self.candidates.iter().map(left).max().unwrap_or(0)
     }
 
     /// See [`Descent::allow`].
     pub fn allow(&mut self, evaluations: Option<usize>) {
-        self.descent.allow(evaluations);
+        self.candidates.iter_mut().for_each(|window| window.allow(evaluations));
     }
 
     /// Resident size in bytes, beside its own: the copy of the episode, and the working memory.
     pub fn size_bytes(&self) -> usize {
-        self.episode.size_bytes() + self.latents.size_bytes() + self.descent.size_bytes() + self.anchor.size_bytes()
+        let floats = (self.told.capacity() + self.truth.capacity()) * size_of::<f32>();
+        let windows =
+            self.candidates.capacity() * size_of::<Candidate>() + self.candidates.iter().map(Candidate::size_bytes).sum::<usize>();
+        self.episode.size_bytes() + floats + windows + self.anchor.size_bytes()
     }
 
-    /// Chooses between the stored window and a cold start, and fills the window.
+    /// How its chunk is sampled.
+    pub(super) fn options(&self) -> &SamplerOptions {
+        self.episode.options()
+    }
+
+    /// Its windows.
+    pub(super) fn candidates(&self) -> &[Candidate] {
+        &self.candidates
+    }
+
+    /// The windows that ask this.
+    pub(super) fn asking_mut(&mut self, ask: Ask) -> impl Iterator<Item = &mut Candidate> {
+        let Self { candidates, episode, .. } = self;
+        candidates.iter_mut().filter(move |window| window.asks(ask, episode.options()))
+    }
+
+    #[cfg(test)]
+    pub(super) fn first_mut(&mut self) -> &mut Candidate {
+        &mut self.candidates[0]
+    }
+
+    /// The window of one that has a single one, and of all before they go ways of their own.
+    fn first(&self) -> &Candidate {
+        &self.candidates[0]
+    }
+
+    /// The latent at a position, of all its windows: they have not begun.
+    pub(super) fn set_latent(&mut self, position: usize, latent: GaussianRef) {
+        self.candidates.iter_mut().for_each(|window| window.set_latent(position, latent));
+    }
+
+    /// Latents of an oracle: what it was told, as sure as a latent can be.
+    pub(super) fn set_truth(&mut self) {
+        let Self { candidates, truth, .. } = self;
+        candidates.iter_mut().for_each(|window| window.set_truth(truth));
+    }
+
+    /// What is told of what is wanted, and 1; zeros where nothing is, or the window is to be denoised without it.
+    pub(super) fn write_told(&self, told: bool, out: &mut [f32]) {
+        if told {
+            out.copy_from_slice(&self.told);
+        }
+    }
+
+    /// Chooses between the stored window and a cold start, and fills the windows.
     pub(super) fn start(&mut self, config: &ModelConfig, walk: Walk) {
         self.started = true;
-        let belief = self.latents.get(0);
-        let rung = self.descent.rung();
-        self.start = self.stored().map_or(Start::Cold, |stored| choose_start(stored, self.descent.known(), belief, rung, config));
+        let (belief, rung) = (self.first().latents().get(0), self.first().descent().rung());
+        let known = self.first().descent().known();
+        self.start = self.stored().map_or(Start::Cold, |stored| choose_start(stored, known, belief, rung, config));
         match (self.start, self.episode.take_stored()) {
             (Start::Cold, _) | (_, None) => {
-                self.anchor.set(0, belief);
-                self.descent.begin_cold(walk);
+                self.anchor.set(0, self.candidates[0].latents().get(0));
+                self.candidates.iter_mut().for_each(|window| window.begin_cold(walk));
             }
             (Start::Warm, Some(stored)) => self.resume(&stored, 0, walk),
             (Start::Renoised(rungs), Some(stored)) => self.resume(&stored, rungs as usize * rung, walk),
@@ -133,42 +205,37 @@ impl Act {
 
     fn resume(&mut self, stored: &Stored, rows: usize, walk: Walk) {
         self.anchor.set(0, stored.anchor());
-        self.descent.begin_with(stored.window(), rows, walk);
+        self.candidates.iter_mut().for_each(|window| window.begin_with(stored.window(), rows, walk));
     }
 
     /// The window that the act before left for this time, if there is one.
     fn stored(&self) -> Option<&Stored> {
-        self.episode.stored().filter(|_| self.aligned && self.episode.options().streaming)
+        self.episode.stored().filter(|_| self.aligned && self.options().streaming)
     }
 
     /// See [`super::Agent::cut_short`].
     pub(super) fn cut_short(&mut self, config: &ModelConfig, walk: Walk) -> bool {
         if self.started {
-            if self.descent.evaluations() == 0 {
+            let empty = |window: &Candidate| window.descent().evaluations() == 0 || window.descent().is_done();
+            if self.candidates.iter().all(empty) {
                 return false;
             }
-            self.descent.cut_short(walk);
+            self.candidates.iter_mut().for_each(|window| window.cut_short(walk));
             return true;
         }
-        let near = |stored: &&Stored| stored.surprise(self.descent.known()) < config.defaults.restart.cold_distance;
+        let near = |stored: &&Stored| stored.surprise(self.first().descent().known()) < config.defaults.restart.cold_distance;
         if self.stored().filter(near).is_none() {
             return false;
         }
         let Some(stored) = self.episode.take_stored() else { return false };
         (self.started, self.start) = (true, Start::Warm);
         self.anchor.set(0, stored.anchor());
-        self.descent.give_as_it_is(stored.window(), walk);
+        for window in &mut self.candidates {
+            // Nobody was asked for the latents of now.
+            window.believe(stored.anchor());
+            window.give_as_it_is(stored.window(), walk);
+        }
         true
-    }
-
-    /// The latents of the window, the first of them that of its position 0.
-    pub(super) fn latents(&self) -> &Chain {
-        &self.latents
-    }
-
-    /// See [`Self::latents`].
-    pub(super) fn latents_mut(&mut self) -> &mut Chain {
-        &mut self.latents
     }
 
     /// State of the GRU that runs on over the episode.
@@ -191,29 +258,14 @@ impl Act {
         self.episode.remember(state, keep);
     }
 
-    /// Trust region of the refinement, nats.
-    pub(super) fn kappa(&self) -> f32 {
-        self.episode.options().kappa
-    }
-
-    /// The window on its way.
-    pub(super) fn descent(&self) -> &Descent {
-        &self.descent
-    }
-
-    #[cfg(test)]
-    pub(super) fn descent_mut(&mut self) -> &mut Descent {
-        &mut self.descent
-    }
-
-    /// Writes the latents of the window, `T * latent_dim` values: means, or draws by the noise of each position's absolute time.
-    pub(super) fn write_latents(&self, out: &mut [f32]) {
-        for (position, out) in out.chunks_exact_mut(self.latents.dim().max(1)).enumerate() {
-            let latent = self.latents.get(position);
-            match self.episode.options().latent {
+    /// Writes the latents of a window from position 0 on: means, or draws by the noise of each position's absolute time.
+    pub(super) fn write_latents(&self, window: &Candidate, out: &mut [f32]) {
+        for (position, out) in out.chunks_exact_mut(window.latents().dim().max(1)).enumerate() {
+            let latent = window.latents().get(position);
+            match self.options().latent {
                 LatentMode::Mean => out.copy_from_slice(latent.mean),
                 LatentMode::Sample => {
-                    let (noise, time) = (Noise::new(self.episode.seed()), self.descent.time() + position as u64);
+                    let (noise, time) = (Noise::new(self.episode.seed()), window.descent().time() + position as u64);
                     noise.fill(time, 0, Slot::Latent, out);
                     let columns = out.iter_mut().zip(latent.mean.iter().zip(latent.log_var));
                     columns.for_each(|(out, (mean, log_var))| *out = mean + (log_var / 2.0).exp() * *out);
@@ -222,65 +274,80 @@ impl Act {
         }
     }
 
-    /// The past of position 0, the last token first: imagined ones, after the first action of a chunk, and real ones behind them.
-    pub(super) fn past(&self, back: usize, walk: Walk) -> Option<TokenRef<'_>> {
-        let imagined = self.descent.given_len();
+    /// The past of position 0 of a window, the last token first: imagined ones, after the first action of a chunk, and real ones behind them.
+    pub(super) fn past<'a>(&'a self, window: &'a Candidate, back: usize, walk: Walk) -> Option<TokenRef<'a>> {
+        let imagined = window.descent().given_len();
         match back.checked_sub(imagined) {
             Some(back) => self.episode.past(back),
-            None => Some(window_token(self.descent.given(imagined - 1 - back), walk)),
+            None => Some(window.imagined(imagined - 1 - back, walk)),
         }
     }
 
-    /// Token `position` from the current one on: the real state, or what the window has there. Of a future that has not come an act has
-    /// nothing.
-    pub(super) fn ahead(&self, position: usize, evidence: Evidence, walk: Walk) -> TokenRef<'_> {
+    /// Token `position` of a window from the current one on: the real state, or what the window has there. Of a future that has not come an act
+    /// has nothing.
+    pub(super) fn ahead<'a>(&self, window: &'a Candidate, position: usize, evidence: Evidence, walk: Walk) -> TokenRef<'a> {
         match evidence {
-            Evidence::Filter => TokenRef { state: Some(self.descent.known()), ..TokenRef::default() },
-            Evidence::Refinement => {
-                TokenRef { noise: self.descent.sigma(position, walk), ..window_token(self.descent.position(position), walk) }
-            }
+            Evidence::Filter => TokenRef { state: Some(window.descent().known()), ..TokenRef::default() },
+            Evidence::Refinement => window.token(position, walk),
             Evidence::SuccessorState | Evidence::Successor => TokenRef::default(),
         }
     }
 
-    /// Takes the network's estimate of the clean window.
-    pub(super) fn step_down(&mut self, x0: &[f32], walk: Walk) {
-        let given = self.descent.given_len();
-        self.descent.step_down(x0, walk);
-        self.latents.advance(self.descent.given_len() - given);
+    /// Takes note of what the candidates are worth, and chooses one: the best, of those that are as good the first; or by chance, each with
+    /// probability `exp(value / temperature)`.
+    pub(super) fn choose(&mut self, values: &[f32]) {
+        let temperature = self.options().pick_temperature;
+        let best = (0..values.len()).fold(0, |best, index| if values[index] > values[best] { index } else { best });
+        let weight = |value: f32| ((value - values[best]) / temperature).exp();
+        let index = if temperature > 0.0 {
+            let all: f32 = values.iter().map(|value| weight(*value)).sum();
+            let mut left = all * Noise::new(self.episode.seed()).uniform(self.episode.time(), Slot::Choice);
+            let passed = |value: &f32| {
+                left -= weight(*value);
+                left < 0.0
+            };
+            values.iter().position(passed).unwrap_or(best)
+        } else {
+            best
+        };
+        let count = values.len() as f32;
+        let mean = values.iter().sum::<f32>() / count;
+        let spread = (values.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / count).sqrt();
+        self.choice = Choice { made: true, index, worth: Some((values[index], spread)) };
     }
 
     pub(super) fn finish(self, config: &ModelConfig, walk: Walk) -> Result<(Episode, Chunk), AgentError> {
-        if self.descent.has_failed() {
+        if self.has_failed() || self.choice.worth.is_some_and(|(value, _)| !value.is_finite()) {
             return Err(AgentError::NonFinite);
         }
-        let (normalizer, descent) = (&config.units.normalizer, &self.descent);
-        let action = |position| descent.given(position)[walk.columns.action.clone()].to_vec();
-        let actions: Vec<Vec<f32>> = (0..descent.given_len()).map(action).collect();
+        let (evaluations, passes) = (self.evaluations(), self.passes());
+        let Self { mut candidates, episode, anchor, start, choice, .. } = self;
+        let chosen = candidates.swap_remove(choice.index);
+        let (normalizer, descent) = (&config.units.normalizer, chosen.descent());
+        let actions: Vec<Vec<f32>> = (0..chosen.actions_len()).map(|index| chosen.action(index).to_vec()).collect();
         let states = descent.planned().chunks(walk.columns.width()).map(|position| &position[walk.columns.state.clone()]);
         // An act that never asked the network has no latent of its own.
-        let latent = match self.episode.latent().filter(|_| descent.evaluations() == 0) {
+        let latent = match episode.latent().filter(|_| descent.evaluations() == 0) {
             Some((mean, log_var)) => (mean.to_vec(), log_var.to_vec()),
-            None => self.latents.of_first_step(),
+            None => chosen.latents().of_first_step(),
         };
+        let returns = config.units.returns.as_ref();
+        let raw = |value: f32| returns.map_or(value, |returns| returns.mean[0] + returns.std[0] * value);
         let chunk = Chunk {
             actions: actions.iter().map(|action| normalizer.action.denormalize(action)).collect(),
             planned_states: states.map(|state| normalizer.state.denormalize(state)).collect(),
             latent_mean: latent.0.clone(),
             latent_log_var: latent.1.clone(),
             predicted_state: normalizer.state.denormalize(descent.predicted_state()),
-            evaluations: descent.evaluations(),
-            start: self.start,
+            evaluations,
+            passes,
+            value: choice.worth.map(|(value, _)| raw(value)),
+            value_spread: choice.worth.map(|(_, spread)| raw(spread) - raw(0.0)),
+            start,
             degraded: descent.is_degraded(),
         };
         let planned = Planned::new(descent.known().to_vec(), actions);
-        let stored = Stored::new(self.descent.into_window(), self.anchor);
-        Ok((self.episode.after(planned, stored, latent), chunk))
+        let stored = Stored::new(chosen.into_window(), anchor);
+        Ok((episode.after(planned, stored, latent), chunk))
     }
-}
-
-/// A position of a window as a token.
-fn window_token<'a>(position: &'a [f32], walk: Walk) -> TokenRef<'a> {
-    let columns = walk.columns;
-    TokenRef { state: Some(&position[columns.state.clone()]), action: Some(&position[columns.action.clone()]), ..TokenRef::default() }
 }

@@ -1,6 +1,6 @@
 //! The latents of an act in progress, each known from the one before by the prior.
 
-use crate::model::latent::GaussianRef;
+use crate::model::latent::{GaussianRef, LOG_VAR};
 use std::ops::Range;
 
 /// Distributions of the latents from the act's first position on, `T + action_horizon - 1` of them; without any for a model without
@@ -44,6 +44,16 @@ impl Chain {
         }
     }
 
+    /// Mean of the latent of a step of the act, given out or not.
+    pub(super) fn mean_of_step(&self, step: usize) -> &[f32] {
+        &self.mean[step * self.dim..][..self.dim]
+    }
+
+    /// Means of the latents from the act's first step on.
+    pub(super) fn write_means(&self, out: &mut [f32]) {
+        out.copy_from_slice(&self.mean[..out.len()]);
+    }
+
     /// Mean and log-variance at the act's first position.
     pub(super) fn of_first_step(&self) -> (Vec<f32>, Vec<f32>) {
         (self.mean[..self.dim].to_vec(), self.log_var[..self.dim].to_vec())
@@ -58,6 +68,12 @@ impl Chain {
     pub(super) fn get(&self, position: usize) -> GaussianRef<'_> {
         let range = self.range(position);
         GaussianRef { mean: &self.mean[range.clone()], log_var: &self.log_var[range] }
+    }
+
+    /// Means of the latents from position 0 on, of which nothing is uncertain.
+    pub(super) fn set_certain(&mut self, means: &[f32]) {
+        self.mean[..means.len()].copy_from_slice(means);
+        self.log_var.fill(LOG_VAR.0);
     }
 
     /// Replaces it; positions beyond the last are not kept.

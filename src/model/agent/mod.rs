@@ -4,9 +4,12 @@
 //! answers all that is asked, with one denoiser forward shared by all acts given to it, whatever rungs they stand on.
 mod act;
 mod answers;
+mod ask;
+mod candidate;
 mod chain;
 mod episode;
 mod executed;
+mod guide;
 mod restart;
 mod rows;
 mod types;
@@ -14,16 +17,18 @@ mod types;
 #[cfg(test)]
 mod tests;
 
-pub use act::{Act, Ask};
+pub use act::Act;
+pub use ask::Ask;
 pub use episode::Episode;
+use types::Known;
 pub use types::{AgentError, Chunk, Executed, Observation, Spec, Start};
 
 use crate::model::{
     Networks,
     columns::{Bounds, Columns},
     config::ModelConfig,
-    diffusion::{descent::Walk, process::Process, schedule::Table},
-    method::GruLatent,
+    diffusion::{descent::Walk, guidance::Judge, process::Process, schedule::Table},
+    method::{GruLatent, Told, TrueFuture},
     options::SamplerOptions,
 };
 
@@ -35,8 +40,11 @@ pub struct Agent {
     config: ModelConfig,
     networks: Networks,
     process: Process,
+    /// Of inverse dynamics that are a diffusion.
+    inverse: Option<Process>,
     columns: Columns,
     bounds: Bounds,
+    action_bounds: Bounds,
     spec: Spec,
 }
 
@@ -54,11 +62,17 @@ impl Agent {
             action_high: config.units.action_high.clone(),
             sampler: config.defaults.sampler.clone(),
             trained: config.trained.clone(),
+            told: config.method.told.clone(),
+            returns: config.units.returns.as_ref().map(|returns| [returns.mean[0], returns.std[0]]),
+            guide: config.method.guide.is_some(),
+            context: config.method.latent.truth(),
             digest,
         };
-        let columns = Columns::state_action(config.layout);
-        let bounds = Bounds::new(&columns, config.method.plan.clip, &config.units);
-        Self { process: Process::cosine(config.method.plan.level_max), columns, bounds, config, networks, spec }
+        let plan = &config.method.plan;
+        let columns = Columns::new(plan.diffused, config.layout);
+        let (bounds, action_bounds) = (Bounds::new(&columns, plan.clip, &config.units), Bounds::of_actions(&config.units));
+        let inverse = config.method.head.level_max().map(Process::cosine);
+        Self { process: Process::cosine(plan.level_max), inverse, columns, bounds, action_bounds, config, networks, spec }
     }
 
     /// What a client must know of it.
@@ -107,11 +121,72 @@ impl Agent {
         let mut episode = episode.clone();
         let executed = self.executed_tokens(&episode, observation)?;
         let (options, plan) = (episode.options(), &self.config.method.plan);
-        let aligned = executed.len() == options.action_horizon;
-        let table = Table::new(plan.schedule, plan.horizon, options.sub_steps, plan.level_max);
+        let known = Known {
+            state,
+            told: self.told(options),
+            truth: self.truth(observation.context.as_deref(), options.action_horizon)?,
+            aligned: executed.len() == options.action_horizon,
+        };
+        let table = Table::of(plan, options.sub_steps);
         let table = table.map_err(|reason| AgentError::InvalidOptions { field: "sub_steps", reason })?;
         episode.commit(executed, self.config.method.latent.block_len().max(plan.obs_horizon));
-        Ok(Act::new(episode, state, table, aligned, &self.config))
+        Ok(Act::new(episode, known, table, &self.config))
+    }
+
+    /// What is told of what is wanted, normalized, and 1; zeros where nothing is.
+    fn told(&self, options: &SamplerOptions) -> Vec<f32> {
+        let method = &self.config.method;
+        let width = if method.told.is_empty() { 0 } else { method.told_width() + 1 };
+        if !options.tells() {
+            return vec![0.0; width];
+        }
+        let mut told = Vec::with_capacity(width);
+        for kind in &method.told {
+            match kind {
+                Told::Return => {
+                    let units = self.config.units.returns.as_ref();
+                    told.extend(options.told_return.iter().zip(units).map(|(value, units)| (value - units.mean[0]) / units.std[0]));
+                }
+                Told::Goal { columns } => {
+                    let units = &self.config.units.normalizer.state;
+                    let values = options.told_goal.iter().flatten().zip(columns);
+                    told.extend(values.map(|(value, column)| (value - units.mean[*column]) / units.std[*column]));
+                }
+            }
+        }
+        told.push(1.0);
+        told
+    }
+
+    /// The true context of an oracle's positions, normalized, one after the other; of others nothing, and nothing is taken. What is told last holds
+    /// for what comes then.
+    fn truth(&self, context: Option<&[Vec<f32>]>, actions: usize) -> Result<Vec<f32>, AgentError> {
+        let invalid = |reason: String| AgentError::InvalidObservation { field: "context".into(), reason };
+        let (Some((dim, future)), Some(units)) = (self.config.method.latent.truth(), &self.config.units.context) else {
+            let untaken = || invalid("this checkpoint finds out by itself, or knows nothing of it: leave the field out".into());
+            return if context.is_none() { Ok(Vec::new()) } else { Err(untaken()) };
+        };
+        let rows = context.unwrap_or_default();
+        let positions = self.config.method.plan.horizon + actions - 1;
+        let most = match future {
+            TrueFuture::Held => 1,
+            TrueFuture::Known => positions,
+        };
+        if !(1..=most).contains(&rows.len()) {
+            let wanted = if most == 1 { "one row, the context of now".into() } else { format!("1 to {most} rows, from that of now on") };
+            return Err(invalid(format!("has {} rows; this checkpoint is an oracle and takes {wanted}, of {dim} values each", rows.len())));
+        }
+        let mut truth = Vec::with_capacity(positions * dim);
+        for (index, row) in rows.iter().enumerate() {
+            let field = format!("context[{index}]");
+            let normalized = units.normalize(&self.checked(&field, row, dim)?);
+            let far = |(column, value): (usize, &f32)| known(&format!("{field}[{column}]"), row[column], *value);
+            normalized.iter().enumerate().try_for_each(far)?;
+            truth.extend(normalized);
+        }
+        let last = truth[truth.len() - dim..].to_vec();
+        (rows.len()..positions).for_each(|_| truth.extend_from_slice(&last));
+        Ok(truth)
     }
 
     /// One denoiser forward shared by all these acts, none of which is done; acts do not influence each other.
@@ -148,6 +223,20 @@ impl Agent {
         }
         let [act] = acts;
         self.finish(act)
+    }
+
+    /// The levels of inverse dynamics that are a diffusion.
+    fn inverse_process(&self) -> Option<&Process> {
+        self.inverse.as_ref()
+    }
+
+    /// Where an action is held, units of the networks.
+    fn action_bounds(&self) -> &Bounds {
+        &self.action_bounds
+    }
+
+    fn judge(&self) -> Judge<'_> {
+        Judge { networks: &self.networks, config: &self.config, walk: self.walk() }
     }
 
     fn walk(&self) -> Walk<'_> {

@@ -3,7 +3,6 @@
 use super::*;
 use crate::model::{
     config::Restart,
-    latent::Evidence,
     method::Schedule,
     method::{Backbone, Future, GruLatent, Looks},
     nn::params::Params,
@@ -14,6 +13,8 @@ use crate::model::{
 };
 
 mod executed;
+mod guidance;
+mod methods;
 mod running;
 mod trained;
 
@@ -24,13 +25,23 @@ fn options() -> SamplerOptions {
 }
 
 fn agent(latents: bool, obs_horizon: usize, denoiser: Backbone) -> Agent {
+    agent_with(latents, obs_horizon, denoiser, |_| {})
+}
+
+/// The same, changed.
+fn agent_with(latents: bool, obs_horizon: usize, denoiser: Backbone, change: impl FnOnce(&mut ModelConfig)) -> Agent {
     let latent = latents.then_some(GruLatent::plain(5, 16, Looks::Block(4)));
     let mut config = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, latent, denoiser);
     config.units.normalizer.state = Affine { mean: vec![0.5, 0.0, -0.5], std: vec![2.0, 1.0, 0.5] };
     config.defaults.restart = Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: f32::INFINITY, ..Restart::default() };
     config.trained.sub_steps = (1..=10).collect();
     config.method.plan.obs_horizon = obs_horizon;
-    let networks = Networks::new(config.layout, &config.method, &Params::fresh(3)).unwrap();
+    change(&mut config);
+    config.check().unwrap();
+    let fresh = Params::fresh(3);
+    Networks::new(config.layout, &config.method, &fresh).unwrap();
+    let tensors = fresh.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
+    let networks = Networks::new(config.layout, &config.method, &Params::loaded(tensors)).unwrap();
     Agent::new(config, networks, "test".into())
 }
 
@@ -71,11 +82,31 @@ fn evaluations_follow_the_formulas() {
 
 #[test]
 fn same_seed_same_bytes_other_seed_others() {
-    for agent in [agent(true, 1, unet()), agent(false, 3, Backbone::Dit { width: 16, depth: 1, heads: 2 })] {
+    for agent in [agent(true, 1, unet()), agent(false, 3, Backbone::dit(16, 1, 2))] {
         let options = SamplerOptions { eta: 1.0, latent: LatentMode::Sample, ..options() };
         assert_eq!(run(&agent, 5, &options, 4), run(&agent, 5, &options, 4));
         assert_ne!(run(&agent, 5, &options, 1)[0].actions, run(&agent, 6, &options, 1)[0].actions);
     }
+}
+
+/// Acts on these episodes and observations, which join one after the other, each alone and all together.
+fn alone_and_together(agent: &Agent, episodes: &[Episode], observations: &[Observation]) -> [Vec<(Episode, Chunk)>; 2] {
+    let alone = episodes.iter().zip(observations).map(|(episode, seen)| agent.act(episode, seen).unwrap()).collect();
+    let mut waiting: Vec<(usize, Act)> = Vec::new();
+    let mut together: Vec<Option<(Episode, Chunk)>> = vec![None; episodes.len()];
+    let mut next = 0;
+    while together.iter().any(Option::is_none) {
+        if next < episodes.len() {
+            waiting.push((next, agent.begin(&episodes[next], &observations[next]).unwrap()));
+            next += 1;
+        }
+        let (indices, mut acts): (Vec<_>, Vec<_>) = waiting.into_iter().unzip();
+        agent.advance(&mut acts).unwrap();
+        let (done, rest): (Vec<_>, Vec<_>) = indices.into_iter().zip(acts).partition(|(_, act)| act.is_done());
+        done.into_iter().for_each(|(index, act)| together[index] = Some(agent.finish(act).unwrap()));
+        waiting = rest;
+    }
+    [alone, together.into_iter().flatten().collect()]
 }
 
 /// Rows of a forward do not influence each other, whatever rungs they stand on and whatever their options.
@@ -86,27 +117,14 @@ fn a_batch_is_its_rows() {
         kappa: [0.0, 0.1, f32::INFINITY][i as usize % 3],
         action_horizon: 1 + i as usize % 3,
         sub_steps: 1 + i as usize % 2,
+        picard_window: [1, 4][i as usize % 2],
         ..options()
     };
     let mut stream = Philox::new(4);
     let observations: Vec<Observation> = (0..7).map(|_| observation(&mut stream)).collect();
     let episodes: Vec<Episode> = (0..7).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
-    let alone: Vec<_> = episodes.iter().zip(&observations).map(|(episode, seen)| agent.act(episode, seen).unwrap()).collect();
-    let mut waiting: Vec<(usize, Act)> = Vec::new();
-    let mut together: Vec<Option<(Episode, Chunk)>> = vec![None; 7];
-    let mut next = 0;
-    while together.iter().any(Option::is_none) {
-        if next < 7 {
-            waiting.push((next, agent.begin(&episodes[next], &observations[next]).unwrap()));
-            next += 1;
-        }
-        let (indices, mut acts): (Vec<_>, Vec<_>) = waiting.into_iter().unzip();
-        agent.advance(&mut acts).unwrap();
-        let (done, rest): (Vec<_>, Vec<_>) = indices.into_iter().zip(acts).partition(|(_, act)| act.is_done());
-        done.into_iter().for_each(|(index, act)| together[index] = Some(agent.finish(act).unwrap()));
-        waiting = rest;
-    }
-    assert_eq!(together.into_iter().flatten().collect::<Vec<_>>(), alone);
+    let [alone, together] = alone_and_together(&agent, &episodes, &observations);
+    assert_eq!(together, alone);
 }
 
 /// One act of three actions is the first three emissions of three acts of one, when what was imagined then really happened and the
@@ -254,7 +272,7 @@ fn bad_options_name_the_field() {
 /// DDIM and DDPM loop over the same network and noise.
 #[test]
 fn one_position_is_the_plain_sampler() {
-    let mut agent = agent(false, 1, Backbone::Dit { width: 16, depth: 1, heads: 2 });
+    let mut agent = agent(false, 1, Backbone::dit(16, 1, 2));
     agent.config.method.plan.horizon = 1;
     for eta in [0.0, 1.0] {
         let options = SamplerOptions { sub_steps: 10, eta, ..options() };
@@ -287,7 +305,7 @@ fn plain_sampler(agent: &Agent, state: &[f32], options: &SamplerOptions) -> Vec<
         let (from, to) = (4 * step, 4 * (step - 1));
         (0..3).for_each(|column| x[column] = f64::from(state[column]));
         let input = Tensor::from_vec(x.iter().map(|v| *v as f32).collect(), (1, 1, 5), &Device::Cpu).unwrap();
-        let condition = Given { levels: &[from as f32], latents: None, observed: None };
+        let condition = Given { levels: &[from as f32], latents: None, observed: None, told: None };
         let x0: Vec<f32> = agent.networks.denoiser.predict(&input, &condition).unwrap().flatten_all().unwrap().to_vec1().unwrap();
         let (a, b) = (agent.process.alpha_bar(from), agent.process.alpha_bar(to));
         let z = draw((step - 1) as u32, Slot::Jump);
@@ -313,18 +331,18 @@ fn rows_hold_the_real_state_and_refine_once_an_action() {
     let options = SamplerOptions { sub_steps: 2, action_horizon: 3, ..options() };
     let mut stream = Philox::new(1);
     let mut acts = [agent.begin(&agent.open(1, &options).unwrap(), &observation(&mut stream)).unwrap()];
-    let ladder = Table::new(Schedule::Ladder, HORIZON, 2, 40).unwrap();
+    let ladder = Table::new(Schedule::LADDER, [0, HORIZON], 2, 40).unwrap();
     let (mut refined, mut emitted) = (0, 0);
     while !acts[0].is_done() {
         if acts[0].asks(Ask::Refine) {
-            let noise = [0, 1].map(|position| acts[0].ahead(position, Evidence::Refinement, agent.walk()).noise);
+            let noise = [0, 1].map(|position| acts[0].candidates()[0].token(position, agent.walk()).noise);
             assert_eq!(noise, [ladder.level(2), ladder.level(4)].map(|level| agent.process.sigma(level)));
             refined += 1;
         }
         agent.advance(&mut acts).unwrap();
-        emitted = acts[0].descent().given_len();
+        emitted = acts[0].candidates()[0].descent().given_len();
         if emitted == 0 {
-            assert_eq!(acts[0].descent().x()[..3], acts[0].descent().known()[..]);
+            assert_eq!(acts[0].candidates()[0].descent().x(0)[..3], acts[0].candidates()[0].descent().known()[..]);
         }
     }
     assert_eq!((refined, emitted), (3, 3));
@@ -368,16 +386,16 @@ fn an_allowance_makes_larger_jumps() {
 fn a_jump_ends_at_ready() {
     let agent = agent(true, 1, unet());
     let episode = agent.open(1, &SamplerOptions { sub_steps: 3, ..options() }).unwrap();
-    let ready = Table::new(Schedule::Ladder, HORIZON, 3, 40).unwrap().ready().unwrap();
+    let ready = Table::new(Schedule::LADDER, [0, HORIZON], 3, 40).unwrap().ready().unwrap();
     for (allowance, row) in [(2, ready), (1, ready - 1 + 4)] {
         let mut acts = [agent.begin(&episode, &observation(&mut Philox::new(1))).unwrap()];
         agent.advance(&mut acts).unwrap();
-        let x = acts[0].descent().x().to_vec();
-        acts[0].descent_mut().stand_at(ready - 1, &x, &[]);
+        let x = acts[0].candidates()[0].descent().x(0).to_vec();
+        acts[0].first_mut().descent_mut().stand_at(ready - 1, &x, &[]);
         acts[0].allow(Some(allowance));
         agent.advance(&mut acts).unwrap();
         // What passes READY by is emitted, and stands at READY with the next position.
-        assert_eq!((acts[0].descent().row(), acts[0].is_done()), (ready, row > ready));
+        assert_eq!((acts[0].candidates()[0].descent().row(), acts[0].is_done()), (ready, row > ready));
     }
 }
 
@@ -427,7 +445,7 @@ fn cut_short_after_an_estimate_gives_its_positions() {
         let mut acts = [agent.begin(&episode, &observation).unwrap()];
         (0..ticks).for_each(|_| agent.advance(&mut acts).unwrap());
         let [mut act] = acts;
-        let (given, estimate) = (act.descent().given_len(), act.descent().x0().to_vec());
+        let (given, estimate) = (act.candidates()[0].descent().given_len(), act.candidates()[0].descent().x0().to_vec());
         assert_eq!(given, ticks / HORIZON);
         assert!(agent.cut_short(&mut act) && act.is_done());
         let (_, chunk) = agent.finish(act).unwrap();

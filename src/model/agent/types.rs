@@ -1,6 +1,12 @@
 //! What goes into an agent and comes out of it: options, observations, chunks, errors.
 
-use crate::model::{config::Trained, nn::plain, options::SamplerOptions, trajectory::Layout};
+use crate::model::{
+    config::Trained,
+    method::{Told, TrueFuture},
+    nn::plain,
+    options::SamplerOptions,
+    trajectory::Layout,
+};
 
 /// What a client must know of a model.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,6 +31,14 @@ pub struct Spec {
     pub sampler: SamplerOptions,
     /// What a session may ask for and leave out.
     pub trained: Trained,
+    /// What a session may tell of what it wants.
+    pub told: Vec<Told>,
+    /// Mean and standard deviation of the data's returns (the discounted mean of the rewards to come), of methods that ask for them.
+    pub returns: Option<[f32; 2]>,
+    /// Whether it has a guide, so that an act may be guided, and have candidates.
+    pub guide: bool,
+    /// Of an oracle: columns of the context that each observation has to tell, and of how many steps.
+    pub context: Option<(usize, TrueFuture)>,
     /// SHA-256 of the checkpoint's manifest, hex.
     pub digest: String,
 }
@@ -34,7 +48,8 @@ impl Observation {
     pub fn size_bytes(&self) -> usize {
         let floats = |values: Option<&Vec<f32>>| values.map_or(0, |values| values.capacity() * size_of::<f32>());
         let executed = self.executed.iter().map(|step| floats(step.state.as_ref()) + floats(step.action.as_ref()));
-        floats(Some(&self.state)) + self.executed.capacity() * size_of::<Executed>() + executed.sum::<usize>()
+        let context = self.context.iter().flatten().map(|row| size_of::<Vec<f32>>() + floats(Some(row)));
+        floats(Some(&self.state)) + self.executed.capacity() * size_of::<Executed>() + executed.sum::<usize>() + context.sum::<usize>()
     }
 }
 
@@ -48,6 +63,8 @@ pub struct Observation {
     pub executed: Vec<Executed>,
     /// None of the last chunk was executed, and no time has passed: this act is in its place. Excludes `executed`.
     pub nothing_executed: bool,
+    /// The true context of now and of the steps to come, one row each; for an oracle alone, which cannot act without.
+    pub context: Option<Vec<Vec<f32>>>,
 }
 
 /// One executed step; what is missing is masked.
@@ -75,8 +92,14 @@ pub struct Chunk {
     pub latent_log_var: Vec<f32>,
     /// Predicted state after the chunk's last action, raw units.
     pub predicted_state: Vec<f32>,
-    /// Denoiser evaluations spent.
+    /// Windows that the denoiser evaluated.
     pub evaluations: u32,
+    /// Forwards of the denoiser that the act took part in, one after the other.
+    pub passes: u32,
+    /// What the guide holds the plan to be worth: the discounted mean of the rewards to come, units of the data.
+    pub value: Option<f32>,
+    /// Standard deviation of that over the candidates.
+    pub value_spread: Option<f32>,
     /// How the window started.
     pub start: Start,
     /// Whether a deadline cut the descent short.
@@ -131,4 +154,16 @@ impl From<candle_core::Error> for AgentError {
     fn from(error: candle_core::Error) -> Self {
         Self::Tensor(error)
     }
+}
+
+/// What is known at the begin of an act, beside its episode; normalized.
+pub(super) struct Known {
+    /// s_tau.
+    pub state: Vec<f32>,
+    /// What is told of what is wanted, and 1 if it is; of no numbers where the model takes nothing.
+    pub told: Vec<f32>,
+    /// The true context of each position, one after the other, of an oracle.
+    pub truth: Vec<f32>,
+    /// Whether the stored window begins at this time.
+    pub aligned: bool,
 }

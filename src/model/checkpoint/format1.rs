@@ -2,7 +2,7 @@
 
 use crate::model::{
     config::{Defaults, Missing, ModelConfig, Restart, Trained, Units},
-    method::{Backbone, Diffusion, GruLatent, LatentSource, Looks, Method, Schedule},
+    method::{Backbone, Diffused, Diffusion, GruLatent, LatentSource, Looks, Method, Schedule, Target},
     normalizer::Normalizer,
     options::SamplerOptions,
     trajectory::Layout,
@@ -59,18 +59,22 @@ impl From<ConfigV1> for ModelConfig {
             horizon: old.plan_horizon,
             obs_horizon: old.obs_horizon,
             level_max: old.level_max,
-            schedule: Schedule::Ladder,
+            diffused: Diffused::StateAction,
+            target: Target::X0,
+            schedule: Schedule::LADDER,
             backbone: old.denoiser,
             clip: old.state_clip,
         };
         Self {
             layout: old.layout,
-            method: Method { latent: old.latent.map_or(LatentSource::None, gru), plan },
+            method: Method::plain(old.latent.map_or(LatentSource::None, gru), plan),
             units: Units {
                 normalizer: old.normalizer,
                 action_low: old.action_low,
                 action_high: old.action_high,
                 latent_spread: old.latent_spread,
+                returns: None,
+                context: None,
             },
             trained: Trained {
                 action_horizons: with(old.action_horizons_trained, old.sampler.action_horizon),

@@ -54,6 +54,8 @@ pub(super) struct Dit {
     time: [Linear; 2],
     /// Latents and noisy values reach the condition as well: the gates may depend on them.
     context: Linear,
+    /// Real steps as tokens, and what they add to their condition.
+    past: Option<[Linear; 2]>,
     blocks: Vec<Block>,
     norm: LayerNorm,
     ada: Linear,
@@ -61,17 +63,28 @@ pub(super) struct Dit {
 }
 
 impl Dit {
-    /// Ready for whole levels, and positions, up to `level_max`.
-    pub(super) fn new([d_in, d_out, width]: [usize; 3], [depth, heads]: [usize; 2], level_max: usize, params: &Params) -> Result<Self> {
+    /// Ready for whole levels, and positions, up to `places`; `past` is the width of a real step, where these are tokens.
+    pub(super) fn new(
+        [d_in, d_out, width]: [usize; 3],
+        [depth, heads]: [usize; 2],
+        (places, past): (usize, Option<usize>),
+        params: &Params,
+    ) -> Result<Self> {
         if heads == 0 || !width.is_multiple_of(heads) {
             candle_core::bail!("denoiser.width {width} must be a multiple of denoiser.heads {heads}");
         }
         let blocks = (0..depth).map(|i| Block::new(width, heads, &params.scope("blocks").scope(i)));
         Ok(Self {
-            sinusoid: Sinusoid::new(width, level_max)?,
+            sinusoid: Sinusoid::new(width, places)?,
             inp: Linear::new(d_in, width, &params.scope("inp"))?,
             time: [Linear::new(width, width, &params.scope("time.0"))?, Linear::new(width, width, &params.scope("time.2"))?],
             context: Linear::new(d_in, width, &params.scope("context"))?,
+            past: past
+                .map(|step| {
+                    let layer = |name: &str| Linear::new(step, width, &params.scope("past").scope(name));
+                    Ok::<_, candle_core::Error>([layer("inp")?, layer("context")?])
+                })
+                .transpose()?,
             blocks: blocks.collect::<Result<_>>()?,
             norm: LayerNorm::new(width, false, EPS, params)?,
             ada: zero_linear(width, 2 * width, &params.scope("ada"))?,
@@ -80,22 +93,32 @@ impl Dit {
     }
 
     pub(super) fn forward<V: Activations>(&self, inputs: &Inputs<V>) -> Result<V> {
-        let cond = self.embed(inputs)?.activated(Silu)?;
-        let mut x = self.inp.forward(inputs.x)?.plus(&self.positions(inputs.x)?)?;
+        let [_, len, _] = inputs.x.shape()?;
+        let tokens = inputs.history.as_ref().map_or(Ok(0), |history| history.shape().map(|[_, steps, _]| steps))?;
+        let mut x = self.inp.forward(inputs.x)?;
+        let mut cond = self.condition(&x, |index| inputs.levels[index], &self.context.forward(inputs.x)?, inputs.whole.as_ref())?;
+        if let (Some([inp, context]), Some(history)) = (&self.past, &inputs.history) {
+            let past = inp.forward(history)?;
+            // They are clean.
+            cond = self.condition(&past, |_| 0.0, &context.forward(history)?, inputs.whole.as_ref())?.followed_by(&cond)?;
+            x = past.followed_by(&x)?;
+        }
+        let (positions, cond) = (self.positions(&x)?, cond.activated(Silu)?);
+        x = x.plus(&positions)?;
         for block in &self.blocks {
             x = block.forward(x, &cond)?;
         }
+        let (x, cond) = if tokens > 0 { (x.last_steps(len)?, cond.last_steps(len)?) } else { (x, cond) };
         let ada = self.ada.forward(&cond)?;
         self.out.forward(&self.norm.forward(&x)?.modulated(&ada)?)
     }
 
-    /// `(B, T, width)`: level of each position, its inputs, and the real steps.
-    fn embed<V: Activations>(&self, inputs: &Inputs<V>) -> Result<V> {
-        let level = self.sinusoids(inputs.x, |index| inputs.levels[index])?;
-        let emb = self.time[1].forward(&self.time[0].forward(&level)?.activated(Mish)?)?;
-        let emb = emb.plus(&self.context.forward(inputs.x)?)?;
-        match &inputs.observed {
-            Some(observed) => emb.plus_at_each_step(observed),
+    /// `(B, T, width)` for the tokens `like`: the level of each, its inputs, and what holds for the whole window.
+    fn condition<V: Activations>(&self, like: &V, level: impl Fn(usize) -> f32, inputs: &V, whole: Option<&V>) -> Result<V> {
+        let level = self.sinusoids(like, level)?;
+        let emb = self.time[1].forward(&self.time[0].forward(&level)?.activated(Mish)?)?.plus(inputs)?;
+        match whole {
+            Some(whole) => emb.plus_at_each_step(whole),
             None => Ok(emb),
         }
     }

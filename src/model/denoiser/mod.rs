@@ -1,13 +1,14 @@
-//! The denoiser epsilon_theta; it predicts x0 (section 4.3 and appendix A.5 of the paper; x0 rather than eps because the losses that
-//! touch the latents are x0 losses, and a rung of the ladder spans many levels).
+//! The denoiser epsilon_theta. It predicts x0 where a recipe says nothing else (section 4.3 and appendix A.5 of the paper; x0 rather than eps
+//! because the losses that touch the latents are x0 losses, and a rung of the ladder spans many levels).
 mod dit;
 mod unet;
 
 use crate::model::{
     fit::{Unfit, WIDTH_MAX, require, size},
-    method::{Backbone, Diffusion, Method},
+    method::{Backbone, Diffusion, History, Method},
     nn::{Activation::Silu, Activations, Linear, params::Params},
     temporal::{EMB, LEVEL_CHANNELS, Levels, check_widths},
+    trajectory::Layout,
 };
 use candle_core::Result;
 use dit::Dit;
@@ -15,8 +16,9 @@ use unet::Unet;
 
 pub use crate::model::temporal::Given;
 
-/// Hidden width of the embedding of real steps.
-const OBSERVED_HIDDEN: usize = 128;
+/// Hidden width of the embedding of what holds for a whole window.
+const WHOLE_HIDDEN: usize = 128;
+const REAL_STEPS: &str = "the real steps before the window (obs_horizon > 1)";
 
 /// Whether the sizes of a backbone fit together and the horizon of its plan.
 ///
@@ -33,7 +35,9 @@ pub(in crate::model) fn check(plan: &Diffusion) -> std::result::Result<(), Unfit
             require(divides, field("widths"), reason)?;
             check_widths(&field("widths"), widths)
         }
-        Backbone::Dit { width, depth, heads } => {
+        Backbone::Dit { width, depth, heads, history } => {
+            let tokens = *history == History::Vector || plan.obs_horizon > 1;
+            require(tokens, field("history"), "is tokens, but there are no real steps before the window (method.plan.obs_horizon = 1)")?;
             size(&field("width"), *width, WIDTH_MAX)?;
             require(*width >= 4 && width.is_multiple_of(2), field("width"), format!("is {width}, must be even and at least 4"))?;
             require(*depth <= dit::DEPTH_MAX, field("depth"), format!("is {depth}, must lie in 0..={}", dit::DEPTH_MAX))?;
@@ -54,8 +58,10 @@ struct Inputs<'a, V> {
     x: &'a V,
     /// `B * T`.
     levels: &'a [f32],
-    /// `(B, 1, emb)` embedding of the real steps.
-    observed: Option<V>,
+    /// `(B, 1, emb)` embedding of the real steps, and of what is told.
+    whole: Option<V>,
+    /// `(B, T_o - 1, state_dim + action_dim)` the real steps, where they are tokens.
+    history: Option<V>,
 }
 
 /// The denoiser of a model.
@@ -64,41 +70,61 @@ pub struct Denoiser {
     net: Net,
     input_skip: Linear,
     observed: Option<[Linear; 2]>,
+    /// Real steps that stand in front of the window as tokens.
+    tokens: usize,
+    told: Option<[Linear; 2]>,
 }
 
 impl Denoiser {
-    /// Networks under `params`' scope, for windows of `columns` columns.
+    /// Networks under `params`' scope.
     ///
     /// # Errors
     /// If a loaded parameter is missing or of another shape.
-    pub fn new(columns: usize, method: &Method, params: &Params) -> Result<Self> {
+    pub fn new(layout: Layout, method: &Method, params: &Params) -> Result<Self> {
         let Diffusion { obs_horizon, level_max, backbone, .. } = &method.plan;
+        let columns = method.plan.width(layout.widths());
         let d_in = columns + method.latent.dim() + LEVEL_CHANNELS;
+        let real_steps = obs_horizon.saturating_sub(1);
+        let tokens = if matches!(backbone, Backbone::Dit { history: History::Tokens, .. }) { real_steps } else { 0 };
         let (net, emb) = match backbone {
             Backbone::Unet { widths } => (Net::Unet(Box::new(Unet::new(d_in, columns, widths, params)?)), EMB),
-            Backbone::Dit { width, depth, heads } => {
+            Backbone::Dit { width, depth, heads, .. } => {
                 let sizes = [d_in, columns, *width];
-                (Net::Dit(Box::new(Dit::new(sizes, [*depth, *heads], *level_max, params)?)), *width)
+                let past = (tokens > 0).then(|| layout.dim());
+                let places = if tokens > 0 { (*level_max).max(tokens + method.plan.horizon) } else { *level_max };
+                (Net::Dit(Box::new(Dit::new(sizes, [*depth, *heads], (places, past), params)?)), *width)
             }
         };
-        let observed = match *obs_horizon {
-            0 | 1 => None,
-            steps => Some([
-                Linear::new((steps - 1) * columns, OBSERVED_HIDDEN, &params.scope("observed.0"))?,
-                Linear::new(OBSERVED_HIDDEN, emb, &params.scope("observed.2"))?,
-            ]),
+        let embedding = |name: &str, width: usize| -> Result<Option<[Linear; 2]>> {
+            let layers = || {
+                let params = params.scope(name);
+                Ok([Linear::new(width, WHOLE_HIDDEN, &params.scope(0))?, Linear::new(WHOLE_HIDDEN, emb, &params.scope(2))?])
+            };
+            (width > 0).then(layers).transpose()
         };
-        let levels = Levels::new(*level_max)?;
-        Ok(Self { levels, net, input_skip: Linear::new(d_in, columns, &params.scope("input_skip"))?, observed })
+        let told = method.told_width();
+        Ok(Self {
+            levels: Levels::new(*level_max)?,
+            net,
+            input_skip: Linear::new(d_in, columns, &params.scope("input_skip"))?,
+            observed: embedding("observed", (real_steps - tokens) * layout.dim())?,
+            tokens,
+            told: embedding("told", if told > 0 { told + 1 } else { 0 })?,
+        })
     }
 
-    /// Estimate of the clean window, `(B, T, D)` to `(B, T, D)`. Row b depends on row b of the inputs alone.
+    /// What the target asks for ([`crate::model::method::Target`]), `(B, T, D)` to `(B, T, D)`. Row b depends on row b of the inputs alone.
     ///
     /// # Errors
     /// If a shape differs from the configuration, or a condition the network was built with is missing.
     pub fn predict<V: Activations>(&self, x: &V, given: &Given<V>) -> Result<V> {
         let x = self.levels.beside(x, given)?;
-        let inputs = Inputs { x: &x, levels: given.levels, observed: self.embed_observed(given.observed)? };
+        let history = match (self.tokens, given.observed) {
+            (0, _) => None,
+            (tokens, Some(observed)) => Some(observed.unflattened(tokens)?),
+            (_, None) => candle_core::bail!("this denoiser needs {REAL_STEPS}"),
+        };
+        let inputs = Inputs { x: &x, levels: given.levels, whole: self.embed_whole(given)?, history };
         let out = match &self.net {
             Net::Unet(net) => net.forward(&inputs)?,
             Net::Dit(net) => net.forward(&inputs)?,
@@ -106,12 +132,22 @@ impl Denoiser {
         out.plus(&self.input_skip.forward(&x)?)
     }
 
-    fn embed_observed<V: Activations>(&self, observed: Option<&V>) -> Result<Option<V>> {
-        match (&self.observed, observed) {
-            (Some([first, second]), Some(steps)) => second.forward(&first.forward(steps)?.activated(Silu)?).map(Some),
-            (Some(_), None) => candle_core::bail!("this denoiser needs the real steps before the window (obs_horizon > 1)"),
-            (None, _) => Ok(None),
+    /// What holds for a whole window: the real steps before it, and what is told.
+    fn embed_whole<V: Activations>(&self, given: &Given<V>) -> Result<Option<V>> {
+        let observed = embedded(self.observed.as_ref(), given.observed, REAL_STEPS)?;
+        let told = embedded(self.told.as_ref(), given.told, "what is told, or that nothing is")?;
+        match (observed, told) {
+            (Some(observed), Some(told)) => observed.plus(&told).map(Some),
+            (observed, told) => Ok(observed.or(told)),
         }
+    }
+}
+
+fn embedded<V: Activations>(layers: Option<&[Linear; 2]>, given: Option<&V>, what: &str) -> Result<Option<V>> {
+    match (layers, given) {
+        (Some([first, second]), Some(given)) => second.forward(&first.forward(given)?.activated(Silu)?).map(Some),
+        (Some(_), None) => candle_core::bail!("this denoiser needs {what}"),
+        (None, _) => Ok(None),
     }
 }
 

@@ -5,7 +5,7 @@ use crate::model::{
     config::ModelConfig,
     golden::Golden,
     method::{GruLatent, Looks},
-    nn::{Buffer, Precision, kernels::testing::with_each_isa},
+    nn::{Buffer, Precision, kernels::testing::with_each_isa, testing::gaussian},
     noise::Philox,
     trajectory::Layout,
 };
@@ -26,21 +26,26 @@ fn config(backbone: Backbone) -> ModelConfig {
     config
 }
 
-fn backbones() -> [Backbone; 2] {
-    [Backbone::Unet { widths: vec![24, 40, 72] }, Backbone::Dit { width: 36, depth: 2, heads: 3 }]
+fn backbones() -> [Backbone; 3] {
+    [Backbone::Unet { widths: vec![24, 40, 72] }, Backbone::dit(36, 2, 3), with_tokens(36, 2, 3)]
+}
+
+/// A transformer that is told the real steps as tokens.
+fn with_tokens(width: usize, depth: usize, heads: usize) -> Backbone {
+    Backbone::Dit { width, depth, heads, history: History::Tokens }
 }
 
 /// The network, jogged so that no gate is closed and no norm plain, with weights packed once.
 fn denoiser(backbone: Backbone, precision: Precision) -> Denoiser {
     let config = config(backbone);
     let fresh = Params::fresh(1);
-    Denoiser::new(LAYOUT.dim(), &config.method, &fresh).unwrap();
+    Denoiser::new(LAYOUT, &config.method, &fresh).unwrap();
     let jog = |(name, var): (String, candle_core::Var)| {
         let mut stream = Philox::named(2, &name);
         let noise: Vec<f32> = (0..var.elem_count()).map(|_| 0.1 * stream.normal()).collect();
         (name, (var.as_tensor() + Tensor::from_vec(noise, var.shape(), var.device()).unwrap()).unwrap())
     };
-    Denoiser::new(LAYOUT.dim(), &config.method, &Params::loaded_as(fresh.vars().into_iter().map(jog).collect(), precision)).unwrap()
+    Denoiser::new(LAYOUT, &config.method, &Params::loaded_as(fresh.vars().into_iter().map(jog).collect(), precision)).unwrap()
 }
 
 /// Inputs of one window, drawn.
@@ -67,7 +72,7 @@ fn predict<V: Activations>(denoiser: &Denoiser, windows: &[Window]) -> V {
     let (x, latents) = (join([LEN, 5], |window| &window.x), join([LEN, LATENT], |window| &window.latents));
     let observed = join([1, OBSERVED], |window| &window.observed);
     let levels: Vec<f32> = windows.iter().flat_map(|window| window.levels.iter().copied()).collect();
-    denoiser.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: Some(&observed) }).unwrap()
+    denoiser.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: Some(&observed), told: None }).unwrap()
 }
 
 fn bits(values: &[f32]) -> Vec<u32> {
@@ -102,7 +107,7 @@ fn bf16_weights_are_near() {
 /// What the network of a golden case is.
 fn golden_config(case: &str) -> ModelConfig {
     let (unet, dit) =
-        (|widths: &[usize]| Backbone::Unet { widths: widths.to_vec() }, |width, depth, heads| Backbone::Dit { width, depth, heads });
+        (|widths: &[usize]| Backbone::Unet { widths: widths.to_vec() }, |width, depth, heads| Backbone::dit(width, depth, heads));
     let (backbone, dim, obs_horizon) = match case {
         "unet" => (unet(&[5, 16, 3]), 4, 3),
         "unet_observed" => (unet(&[4, 4]), 0, 2),
@@ -126,14 +131,14 @@ fn networks_against_pytorch() {
         let (golden, config) = (Golden::of(case), golden_config(case));
         let levels = golden.flat("in.levels");
         golden.check_training(|given, params| {
-            let condition = Given { levels: &levels, latents: given.get("latents"), observed: given.get("observed") };
-            Ok(vec![("x0".into(), Denoiser::new(LAYOUT.dim(), &config.method, params)?.predict(&given["x"], &condition)?)])
+            let condition = Given { levels: &levels, latents: given.get("latents"), observed: given.get("observed"), told: None };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &config.method, params)?.predict(&given["x"], &condition)?)])
         });
         golden.check_serving(|params| {
             let latents: Option<Buffer> = config.method.latent.gru().is_some().then(|| golden.value("in.latents"));
             let observed: Option<Buffer> = (config.method.plan.obs_horizon > 1).then(|| golden.value("in.observed"));
-            let condition = Given { levels: &levels, latents: latents.as_ref(), observed: observed.as_ref() };
-            Ok(vec![("x0".into(), Denoiser::new(LAYOUT.dim(), &config.method, params)?.predict(&golden.value("in.x"), &condition)?)])
+            let condition = Given { levels: &levels, latents: latents.as_ref(), observed: observed.as_ref(), told: None };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &config.method, params)?.predict(&golden.value("in.x"), &condition)?)])
         });
     }
 }
@@ -153,4 +158,22 @@ proptest! {
             }
         }
     }
+}
+
+/// Real steps that are tokens are attended to, each at its own place; a window without any is refused, in a recipe and in a forward.
+#[test]
+fn real_steps_as_tokens() {
+    let denoiser = denoiser(with_tokens(12, 2, 3), Precision::F32);
+    let one = window(3);
+    let told = |observed: Vec<f32>| predict::<Buffer>(&denoiser, &[Window { observed, ..one.clone() }]).to_vec();
+    let swapped = [&one.observed[5..], &one.observed[..5]].concat();
+    let [as_is, turned, none] = [one.observed.clone(), swapped, vec![0.0; OBSERVED]].map(told);
+    assert!(as_is != turned && as_is != none);
+    let mut config = config(with_tokens(12, 2, 3));
+    config.check().unwrap();
+    config.method.plan.obs_horizon = 1;
+    assert_eq!(config.check().unwrap_err().field, "method.plan.backbone.history");
+    let (x, levels) = (gaussian(1, (1, LEN, 5)), vec![1.0; LEN]);
+    let latents = gaussian(2, (1, LEN, LATENT));
+    assert!(denoiser.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None, told: None }).is_err());
 }

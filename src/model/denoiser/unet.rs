@@ -67,11 +67,11 @@ impl Unet {
         level.double.forward(&through(&level.blocks, &V::beside(&[&h, &skip])?, emb)?)
     }
 
-    /// `(B, 1, EMB)`: embedding of each window's mean level, plus that of the real steps.
+    /// `(B, 1, EMB)`: embedding of each window's mean level, plus what holds for the whole window.
     fn embed<V: Activations>(&self, inputs: &Inputs<V>) -> Result<V> {
         let [batch, ..] = inputs.x.shape()?;
         let emb: V = self.time.embed(inputs.levels, batch)?;
-        match &inputs.observed {
+        match &inputs.whole {
             Some(observed) => emb.plus(observed),
             None => Ok(emb),
         }

@@ -1,7 +1,7 @@
 //! A window on its way down the table of levels, one row an evaluation (sections 4.3 and 4.4 of the paper): arithmetic on one window.
 //! It knows of no episode, latent or network.
 
-use super::{process::Process, schedule::Table};
+use super::{picard::Picard, process::Process, schedule::Table};
 use crate::model::{
     columns::{Bounds, Columns},
     noise::{Noise, Slot},
@@ -33,6 +33,8 @@ pub struct Sampling {
     pub noise: Noise,
     /// Environment time of position 0.
     pub time: u64,
+    /// Rows of the table that are evaluated at once, and how far one may move from pass to pass to be accepted; see [`super::picard`].
+    pub at_once: (usize, f32),
 }
 
 /// A window between two acts.
@@ -51,10 +53,10 @@ pub struct Window {
 pub struct Descent {
     sampling: Sampling,
     /// s_tau, normalized: what is known of position 0 until an action has been given out.
-    known: Vec<f32>,
+    pub(super) known: Vec<f32>,
     pub(super) x: Vec<f32>,
     /// The network's last estimate of the clean window, `T * D` values.
-    x0: Vec<f32>,
+    pub(super) x0: Vec<f32>,
     /// Positions given out since that estimate: position `i` of `x` is position `i + dropped` of `x0`.
     dropped: usize,
     pub(super) row: usize,
@@ -62,9 +64,13 @@ pub struct Descent {
     given: Vec<f32>,
     predicted_state: Vec<f32>,
     /// Noise of one position.
-    eps: Vec<f32>,
+    pub(super) eps: Vec<f32>,
     pub(super) evaluations: u32,
-    /// Evaluations that it may still take.
+    /// Forwards that it took part in: fewer than evaluations, where several rows are evaluated at once.
+    pub(super) passes: u32,
+    /// Guesses of the rows below, where several are evaluated at once.
+    pub(super) picard: Picard,
+    /// Passes that it may still take.
     pub(super) allowance: Option<usize>,
     pub(super) degraded: bool,
     failed: bool,
@@ -82,6 +88,8 @@ impl Descent {
             predicted_state: vec![0.0; known.len()],
             eps: vec![0.0; width],
             evaluations: 0,
+            passes: 0,
+            picard: Picard::new(sampling.at_once, horizon * width),
             allowance: None,
             degraded: false,
             failed: false,
@@ -95,6 +103,7 @@ impl Descent {
         self.row = 0;
         (0..self.horizon()).for_each(|position| self.draw_position(position));
         self.write_known(walk);
+        self.guess_anew();
     }
 
     /// Goes on with a window, `rows` rows above where it stands: its positions are noised again up to there.
@@ -105,6 +114,7 @@ impl Descent {
             self.renoise(window.row, walk);
         }
         self.write_known(walk);
+        self.guess_anew();
     }
 
     /// Whether nothing is left to be evaluated.
@@ -122,6 +132,11 @@ impl Descent {
         self.evaluations
     }
 
+    /// Forwards that it took part in so far.
+    pub fn passes(&self) -> u32 {
+        self.passes
+    }
+
     /// Whether a deadline made it take larger jumps, or end before its time.
     pub fn is_degraded(&self) -> bool {
         self.degraded
@@ -132,9 +147,17 @@ impl Descent {
         self.table().ready() == Some(self.row)
     }
 
-    /// The window, `T * D` values.
-    pub fn x(&self) -> &[f32] {
-        &self.x
+    /// Windows that are to be evaluated at once: itself, and guesses of the rows below it.
+    pub fn slots(&self) -> usize {
+        self.picard.slots(self.rows_to_border())
+    }
+
+    /// The window of a slot, `T * D` values.
+    pub fn x(&self, slot: usize) -> &[f32] {
+        match slot.checked_sub(1) {
+            None => &self.x,
+            Some(below) => self.picard.guess(below),
+        }
     }
 
     /// One position of it.
@@ -147,11 +170,14 @@ impl Descent {
         walk.process.sigma(self.table().level(self.table().fine(self.row, position)))
     }
 
-    /// Levels of the window, one a position.
-    pub fn write_levels(&self, out: &mut [f32]) {
-        for (position, out) in out.iter_mut().enumerate() {
-            *out = self.table().level(self.table().fine(self.row, position)) as f32;
-        }
+    /// Level of a position of the window of a slot.
+    pub fn level(&self, slot: usize, position: usize) -> usize {
+        self.table().level(self.table().fine(self.row + slot, position))
+    }
+
+    /// Levels of the window of a slot, one a position.
+    pub fn write_levels(&self, slot: usize, out: &mut [f32]) {
+        out.iter_mut().enumerate().for_each(|(position, out)| *out = self.level(slot, position) as f32);
     }
 
     /// Positions given out: how many, and one of them, `D` values.
@@ -184,6 +210,11 @@ impl Descent {
         &self.known
     }
 
+    /// Where its noise comes from.
+    pub fn noise(&self) -> Noise {
+        self.sampling.noise
+    }
+
     /// Rows that each further action takes.
     pub fn rung(&self) -> usize {
         self.table().rung()
@@ -197,27 +228,48 @@ impl Descent {
     /// Resident size in bytes, beside its own.
     pub fn size_bytes(&self) -> usize {
         let floats = [&self.known, &self.x, &self.x0, &self.given, &self.predicted_state, &self.eps];
-        floats.iter().map(|values| values.capacity() * size_of::<f32>()).sum::<usize>()
+        floats.iter().map(|values| values.capacity() * size_of::<f32>()).sum::<usize>() + self.picard.size_bytes()
     }
 
-    /// Takes the network's estimate of the clean window and goes down: one row, or as many as the allowance asks for.
+    /// Takes the network's estimates of the clean window, `T * D` values for each slot, and goes down: one row, or as many as the allowance asks
+    /// for or the guesses bear out.
     pub fn step_down(&mut self, x0: &[f32], walk: Walk) {
-        self.evaluations += 1;
+        let slots = self.slots();
+        self.evaluations += slots as u32;
+        self.passes += 1;
         if x0.iter().any(|value| !value.is_finite()) {
             self.failed = true;
             return;
         }
-        self.x0.copy_from_slice(x0);
-        self.dropped = 0;
-        self.x0.chunks_mut(self.eps.len().max(1)).for_each(|position| walk.bounds.hold(position));
-        let rows = self.rows_at_once();
-        self.degraded |= rows > 1;
+        if slots > 1 {
+            self.land_at_once(x0, slots, walk);
+        } else {
+            self.take(x0, walk);
+            let rows = self.rows_at_once();
+            self.degraded |= rows > 1;
+            self.jump_rows(rows, walk);
+            self.write_known(walk);
+        }
         self.allowance = self.allowance.map(|left| left.saturating_sub(1).max(1));
-        self.jump_rows(rows, walk);
-        self.write_known(walk);
+        if self.rows_to_border() == 0 || self.table().ready() == Some(self.row) {
+            self.guess_anew();
+        }
         if self.row == self.table().emit() {
             self.emit(walk);
         }
+    }
+
+    /// An estimate of the clean window, held within bounds.
+    pub(super) fn take(&mut self, x0: &[f32], walk: Walk) {
+        self.x0.copy_from_slice(x0);
+        self.dropped = 0;
+        self.x0.chunks_mut(self.eps.len().max(1)).for_each(|position| walk.bounds.hold(position));
+    }
+
+    /// Rows to the next one at which something else happens than a jump: READY, where the latent is refined, or the last.
+    pub(super) fn rows_to_border(&self) -> usize {
+        let border = self.table().ready().filter(|ready| self.row < *ready).unwrap_or(self.table().emit());
+        border - self.row
     }
 
     #[cfg(test)]
@@ -230,6 +282,7 @@ impl Descent {
         self.row = row;
         self.x.copy_from_slice(x);
         self.given = given.to_vec();
+        self.guess_anew();
     }
 
     #[cfg(test)]
@@ -250,11 +303,15 @@ impl Descent {
         self.sampling.actions - self.given_len()
     }
 
-    fn width(&self) -> usize {
+    pub(super) fn sampling(&self) -> &Sampling {
+        &self.sampling
+    }
+
+    pub(super) fn width(&self) -> usize {
         self.eps.len()
     }
 
-    fn horizon(&self) -> usize {
+    pub(super) fn horizon(&self) -> usize {
         self.x.len() / self.width().max(1)
     }
 
@@ -293,26 +350,38 @@ impl Descent {
         self.row += rows;
     }
 
+    /// From here on guesses are made anew: the rows below look like this one.
+    pub(super) fn guess_anew(&mut self) {
+        self.picard.begin(&self.x);
+    }
+
     fn jump(&mut self, position: usize, rows: usize, walk: Walk) {
-        let levels = [self.row, self.row + rows].map(|row| self.table().fine(row, position));
-        let [from, to] = levels.map(|fine| self.table().level(fine));
+        let [from, to] = [self.row, self.row + rows].map(|row| self.table().level(self.table().fine(row, position)));
         if from == to {
             return;
         }
-        let (width, sampling) = (self.width(), self.sampling);
-        let jump = walk.process.jump(from, to, sampling.eta);
-        let scale = jump.noise * sampling.temperature;
-        if jump.noise > 0.0 {
-            // The position joins the level, as in `renoise`: a later act may walk the same levels again.
-            let time = self.time() + position as u64;
-            sampling.noise.fill(time, noise_key(levels[1], position), Slot::Jump, &mut self.eps);
-        } else {
-            self.eps.fill(0.0);
-        }
+        let scale = self.draw_jump(position, rows, walk);
+        let (width, jump) = (self.width(), walk.process.jump(from, to, self.sampling.eta));
         let estimate = (position + self.dropped).min(self.horizon() - 1);
         let columns = self.x[position * width..][..width].iter_mut().zip(&self.x0[estimate * width..][..width]);
         for ((x, x0), noise) in columns.zip(&self.eps) {
             *x = jump.x0 * x0 + jump.eps * walk.process.eps(from, *x, *x0) + scale * noise;
+        }
+    }
+
+    /// Draws the noise of a position's jump so many rows down, and its scale.
+    pub(super) fn draw_jump(&mut self, position: usize, rows: usize, walk: Walk) -> f32 {
+        let fine = [self.row, self.row + rows].map(|row| self.table().fine(row, position));
+        let [from, to] = fine.map(|fine| self.table().level(fine));
+        let (sampling, noise) = (self.sampling, walk.process.jump(from, to, self.sampling.eta).noise);
+        if from != to && noise > 0.0 {
+            // The position joins the level, as in `renoise`: a later act may walk the same levels again.
+            let time = self.time() + position as u64;
+            sampling.noise.fill(time, noise_key(fine[1], position), Slot::Jump, &mut self.eps);
+            noise * sampling.temperature
+        } else {
+            self.eps.fill(0.0);
+            0.0
         }
     }
 

@@ -10,13 +10,13 @@ impl Descent {
         self.allowance = evaluations.map(|evaluations| evaluations.max(1));
     }
 
-    /// Evaluations that the table still asks for.
+    /// Forwards that the table still asks for, if no guess is borne out.
     pub fn evaluations_left(&self) -> usize {
-        self.evaluations_left_from(self.row)
+        self.rows_left(self.row)
     }
 
-    /// Evaluations that a window in this row would need.
-    pub fn evaluations_left_from(&self, row: usize) -> usize {
+    /// Forwards that a window in this row would need.
+    pub fn rows_left(&self, row: usize) -> usize {
         let others = self.actions_left().saturating_sub(1) * self.table().rung();
         self.table().emit().saturating_sub(row) + others
     }

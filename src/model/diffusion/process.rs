@@ -1,5 +1,7 @@
 //! The diffusion process: cosine alpha-bar, q_sample, and jumps between levels (section 3 of the paper; Nichol and Dhariwal 2021).
 
+use crate::model::method::Target;
+
 /// Largest beta of the cosine schedule.
 const BETA_MAX: f64 = 0.999;
 
@@ -57,6 +59,27 @@ impl Process {
     pub fn renoise(&self, from: usize, to: usize) -> (f32, f32) {
         let ratio = self.alpha_bar[to] / self.alpha_bar[from];
         (ratio.sqrt() as f32, (1.0 - ratio).max(0.0).sqrt() as f32)
+    }
+
+    /// The clean estimate from a sample `x` at `level` and what a denoiser of this target says of it; at level 0 that is the sample itself.
+    pub fn x0(&self, target: Target, level: usize, x: f32, out: f32) -> f32 {
+        let (signal, noise) = self.q_sample(level);
+        match target {
+            Target::X0 => out,
+            Target::Eps if level == 0 => x,
+            Target::Eps => (x - noise * out) / signal,
+            Target::V => signal * x - noise * out,
+        }
+    }
+
+    /// What a denoiser of this target should say of a sample at `level`, of this clean value and noise.
+    pub fn aim(&self, target: Target, level: usize, x0: f32, eps: f32) -> f32 {
+        let (signal, noise) = self.q_sample(level);
+        match target {
+            Target::X0 => x0,
+            Target::Eps => eps,
+            Target::V => signal * eps - noise * x0,
+        }
     }
 
     /// eps_hat from a sample at `level` and the clean estimate.
@@ -120,6 +143,21 @@ mod tests {
             let got = jump.x0 * x0 + jump.eps * process.eps(k, x, x0);
             assert!((f64::from(got) - mean).abs() < 1e-5, "level {k}: {got} against {mean}");
             assert!((f64::from(jump.noise).powi(2) - variance).abs() < 1e-6);
+        }
+    }
+
+    /// Whatever a denoiser is trained to say, the clean value comes back from it, up to rounding that noise makes large.
+    #[test]
+    fn targets_are_one_another() {
+        let process = Process::cosine(40);
+        let (x0, eps) = (0.7_f32, -1.3_f32);
+        for target in [Target::X0, Target::Eps, Target::V] {
+            for level in 0..40 {
+                let (signal, noise) = process.q_sample(level);
+                let x = signal * x0 + noise * eps;
+                let back = process.x0(target, level, x, process.aim(target, level, x0, eps));
+                assert!((back - x0).abs() < 1e-5 / signal, "{target:?} at {level}: {back}");
+            }
         }
     }
 

@@ -12,7 +12,7 @@ use crate::model::{
     columns::Columns,
     denoiser::Given,
     latent::{Evidence, Gaussian, LatentModel, Past, Tokens},
-    method::Diffusion,
+    method::{Diffusion, Target},
     trajectory::{Layout, Seen},
 };
 use candle_core::{Device, Result, Tensor};
@@ -51,6 +51,8 @@ pub enum Standing {
     Row(usize),
     /// Each position at a level of its own, whatever the schedule (diffusion forcing, Chen et al. 2024).
     Levels(Vec<usize>),
+    /// Clean, with latents refined as it stood at READY: a plan that is to be judged.
+    Clean,
 }
 
 /// One batch of windows, normalized units.
@@ -71,13 +73,29 @@ pub struct WindowBatch {
     pub imagined: Vec<usize>,
     /// `(B, T, state_dim + action_dim)` Gaussian draws.
     pub noise: Tensor,
+    /// `(B, 1, told_width + 1)` what each window is told of what is wanted, and 1, or zeros; of models that take it.
+    pub told: Option<Tensor>,
+    /// `(B, T, dim)` the true context of each position, of an oracle.
+    pub truth: Option<Tensor>,
+    /// `(B, 1, 1)` discounted mean of the rewards from position 0 on, standard deviations of the data; of methods that ask for returns.
+    pub returns: Option<Tensor>,
 }
 
 impl WindowBatch {
-    /// Columns of a position.
-    fn columns(&self) -> Result<Columns> {
-        let (state_dim, action_dim) = (self.history.state.dim(2)?, self.history.action.dim(2)?);
-        Ok(Columns::state_action(Layout { state_dim, action_dim }))
+    /// Widths of states and actions.
+    ///
+    /// # Errors
+    /// If tokens have another rank.
+    pub fn layout(&self) -> Result<Layout> {
+        Ok(Layout { state_dim: self.history.state.dim(2)?, action_dim: self.history.action.dim(2)? })
+    }
+
+    /// Columns of a step.
+    ///
+    /// # Errors
+    /// If tokens have another rank.
+    pub fn columns(&self) -> Result<Columns> {
+        Ok(Columns::state_action(self.layout()?))
     }
 
     /// Windows `start..start + len` alone.
@@ -94,6 +112,9 @@ impl WindowBatch {
             at: self.at[start..start + len].to_vec(),
             imagined: self.imagined[start..start + len].to_vec(),
             noise: cut(&self.noise)?,
+            told: self.told.as_ref().map(cut).transpose()?,
+            truth: self.truth.as_ref().map(cut).transpose()?,
+            returns: self.returns.as_ref().map(cut).transpose()?,
         })
     }
 }
@@ -112,15 +133,18 @@ pub struct RefineTerms {
 const LITERAL_PRIOR_WEIGHT: f64 = 0.1;
 
 /// A batch of windows, noised to their rows.
-struct Noised {
+pub(super) struct Noised {
     /// As the denoiser sees it, `(B, T, D)`.
-    x: Tensor,
+    pub(super) x: Tensor,
+    /// What the denoiser should say of it, the same shape.
+    aim: Tensor,
     /// `B * T`.
-    levels: Vec<f32>,
+    pub(super) levels: Vec<f32>,
     /// Whether a window is at or below READY: its latents are refined.
     ready: Vec<bool>,
     /// What the refinement saw: where a window is below READY, the same window as it stood there.
     refined_from: Seat,
+    columns: Columns,
 }
 
 /// Windows in some row each.
@@ -145,14 +169,13 @@ impl Networks {
     /// If a shape differs from the configuration.
     pub fn refine_loss(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<RefineTerms> {
         let noised = Noised::new(plan, batch, options)?;
-        let weights = loss_weights(batch, options)?;
+        let weights = loss_weights(plan, batch, options)?;
         let mut loss = Tensor::new(0f32, &Device::Cpu)?;
         let (mut prior, mut posterior) = ((0.0, 0), (0.0, 0));
         for routed in self.route(batch, &noised, options.routing)? {
             let latents = routed.latents.map(|latents| if options.moves_latents { latents } else { latents.detach() });
-            let condition = Given { levels: &noised.levels, latents: latents.as_ref(), observed: batch.observed.as_ref() };
-            let x0 = self.denoiser.predict(&noised.x, &condition)?;
-            let error = ((x0 - &batch.window)?.sqr()? * &weights)?.sum((1, 2))?;
+            let said = self.denoiser.predict(&noised.x, &noised.given(batch, latents.as_ref()))?;
+            let error = ((said - &noised.aim)?.sqr()? * &weights)?.sum((1, 2))?;
             loss = (loss + error.mean_all()?.affine(routed.weight, 0.0)?)?;
             for (error, refined) in error.to_vec1::<f32>()?.into_iter().zip(routed.refined) {
                 let part = if refined { &mut posterior } else { &mut prior };
@@ -163,19 +186,41 @@ impl Networks {
         Ok(RefineTerms { loss, prior: mean(prior), posterior: mean(posterior) })
     }
 
-    /// What the denoiser reads of a batch: x, levels, latents and real steps.
+    /// Mean square error of what the value network tells of a batch.
+    ///
+    /// # Errors
+    /// If a shape differs from the configuration, or the batch has no returns.
+    pub fn value_loss(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<Tensor> {
+        let (Some(value), Some(returns)) = (&self.guide, &batch.returns) else { candle_core::bail!("there is no value to be learned") };
+        let noised = Noised::new(plan, batch, options)?;
+        let latents = self.route(batch, &noised, options.routing)?.remove(0).latents.map(|latents| latents.detach());
+        let given = Given { told: None, observed: None, ..noised.given(batch, latents.as_ref()) };
+        (value.predict(&noised.x, &given)? - returns)?.sqr()?.mean_all()
+    }
+
+    /// The latents of a batch as the sampler has them, `(B, T, dim)`, cut off from the gradient; none for a model without.
+    ///
+    /// # Errors
+    /// If a shape differs from the configuration.
+    pub fn latents_of(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<Option<Tensor>> {
+        let routed = self.route(batch, &Noised::new(plan, batch, options)?, options.routing)?.remove(0);
+        Ok(routed.latents.map(|latents| latents.detach()))
+    }
+
+    /// What the denoiser reads of a batch: x, levels, latents, real steps and what is told.
     #[cfg(test)]
-    pub(crate) fn read_in_training(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<[Vec<f32>; 4]> {
+    pub(crate) fn read_in_training(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<[Vec<f32>; 5]> {
         let noised = Noised::new(plan, batch, options)?;
         let latents = self.route(batch, &noised, options.routing)?.remove(0).latents;
         let numbers = |tensor: Option<&Tensor>| tensor.map_or(Ok(Vec::new()), |tensor| tensor.flatten_all()?.to_vec1::<f32>());
-        Ok([numbers(Some(&noised.x))?, noised.levels.clone(), numbers(latents.as_ref())?, numbers(batch.observed.as_ref())?])
+        let (observed, told) = (numbers(batch.observed.as_ref())?, numbers(batch.told.as_ref())?);
+        Ok([numbers(Some(&noised.x))?, noised.levels.clone(), numbers(latents.as_ref())?, observed, told])
     }
 
     fn route(&self, batch: &WindowBatch, noised: &Noised, routing: LatentRouting) -> Result<Vec<Routed>> {
         let count = noised.ready.len();
         let Some(latent) = &self.latent else {
-            return Ok(vec![Routed { latents: None, weight: 1.0, refined: vec![false; count] }]);
+            return Ok(vec![Routed { latents: batch.truth.clone(), weight: 1.0, refined: vec![false; count] }]);
         };
         let past = latent.past(&batch.history, batch.history_lens.as_deref())?;
         let prior = || prior_latents(latent, &past, batch);
@@ -200,7 +245,7 @@ impl Networks {
 
 /// Prior roll-out from real history and the current state: what a sampler above READY has.
 fn prior_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch) -> Result<Tensor> {
-    let current = window_tokens(batch, &batch.window, Evidence::Filter.ahead(), None)?;
+    let current = window_tokens(whole(&batch.columns()?), &batch.window, Evidence::Filter.ahead(), None)?;
     let filter = latent.infer_after(past, &current)?;
     chain_means(latent, filter, Vec::new(), batch.window.dim(1)?)
 }
@@ -208,7 +253,8 @@ fn prior_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch) -> Resu
 /// Posterior of position 0 from history and the noised tokens 0 and 1, and the prior chain from it: what a sampler at READY has.
 fn refined_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch, noised: &Noised) -> Result<Tensor> {
     let len = batch.window.dim(1)?;
-    let tokens = window_tokens(batch, &noised.refined_from.x, Evidence::Refinement.ahead_within(len), Some(&noised.refined_from.sigma))?;
+    let Seat { x, sigma } = &noised.refined_from;
+    let tokens = window_tokens([&noised.columns, &batch.columns()?], x, Evidence::Refinement.ahead_within(len), Some(sigma))?;
     let posterior = latent.infer_after(past, &tokens)?;
     let head = posterior.mean.clone();
     chain_means(latent, posterior, vec![head], len - 1)
@@ -227,18 +273,22 @@ fn chain_means(latent: &LatentModel, start: Gaussian, head: Vec<Tensor>, len: us
 /// Posteriors of every position from the clean window itself; the last position, which has no successor, keeps the prior.
 fn teacher_forced_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<Tensor> {
     let (len, before) = (batch.window.dim(1)?, batch.history.batch_len()?.1);
-    let tokens = batch.history.concat(&window_tokens(batch, &batch.window, &vec![Seen::GENERATED; len], None)?)?;
+    let tokens = batch.history.concat(&window_tokens(whole(&batch.columns()?), &batch.window, &vec![Seen::GENERATED; len], None)?)?;
     let seen = tokens.narrow(1, before + len - 1)?.present;
     let posteriors = latent.posteriors(&tokens, &tokens.present, &seen)?.narrow(before, len - 1)?;
     let last = latent.coming(posteriors.narrow(len - 2, 1)?)?;
     Tensor::cat(&[posteriors.mean, last.mean], 1)
 }
 
-/// The first positions of the windows `x` as tokens, of which this is seen.
-fn window_tokens(batch: &WindowBatch, x: &Tensor, seen: &[Seen], sigma: Option<&Tensor>) -> Result<Tokens> {
-    let (rows, len) = (x.dim(0)?, seen.len());
-    let columns = batch.columns()?;
-    let flags: Vec<f32> = seen.iter().flat_map(|seen| seen.flags()).collect();
+/// Windows of all columns.
+fn whole(columns: &Columns) -> [&Columns; 2] {
+    [columns; 2]
+}
+
+/// The first positions of the windows `x` as tokens, of which this is seen; of windows of states no action is, which tokens have all the same.
+fn window_tokens([columns, all]: [&Columns; 2], x: &Tensor, seen: &[Seen], sigma: Option<&Tensor>) -> Result<Tokens> {
+    let (rows, len, states_alone) = (x.dim(0)?, seen.len(), columns.action.is_empty());
+    let flags: Vec<f32> = seen.iter().flat_map(|seen| Seen { action: seen.action && !states_alone, ..*seen }.flags()).collect();
     let present = Tensor::from_vec(flags, (1, len, 3), x.device())?.broadcast_as((rows, len, 3))?.contiguous()?;
     let part = |columns: &Range<usize>, index| {
         let part = x.narrow(1, 0, len)?.narrow(2, columns.start, columns.len())?.contiguous()?;
@@ -247,7 +297,10 @@ fn window_tokens(batch: &WindowBatch, x: &Tensor, seen: &[Seen], sigma: Option<&
     let zeros = Tensor::zeros((rows, len, 1), x.dtype(), x.device())?;
     Ok(Tokens {
         state: part(&columns.state, 0)?,
-        action: part(&columns.action, 1)?,
+        action: match states_alone {
+            true => Tensor::zeros((rows, len, all.action.len()), x.dtype(), x.device())?,
+            false => part(&columns.action, 1)?,
+        },
         reward: zeros.clone(),
         noise: sigma.map_or(Ok(zeros), |sigma| sigma.narrow(1, 0, len)?.contiguous())?,
         present,
@@ -258,60 +311,94 @@ fn window_tokens(batch: &WindowBatch, x: &Tensor, seen: &[Seen], sigma: Option<&
 
 impl Noised {
     fn new(plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<Self> {
-        let table = Table::new(plan.schedule, plan.horizon, options.sub_steps, plan.level_max).map_err(candle_core::Error::Msg)?;
-        let process = Process::cosine(plan.level_max);
+        let table = Table::of(plan, options.sub_steps).map_err(candle_core::Error::Msg)?;
+        let (process, columns) = (Process::cosine(plan.level_max), Columns::new(plan.diffused, batch.layout()?));
         // Rows below READY; none for a window above it.
         let below_ready = |standing: &Standing| match (standing, table.ready()) {
             (Standing::Row(row), Some(ready)) => row.checked_sub(ready),
-            (Standing::Row(_) | Standing::Levels(_), _) => None,
+            (Standing::Clean, Some(_)) => Some(table.rung()),
+            (Standing::Row(_) | Standing::Levels(_) | Standing::Clean, _) => None,
         };
         let at = |above: &dyn Fn(&Standing) -> usize| {
-            let levels = |standing: &Standing| match standing {
-                Standing::Row(row) => table.row(row - above(standing)),
-                Standing::Levels(levels) => levels.clone(),
+            let levels = |standing: &Standing| match (standing, above(standing)) {
+                (Standing::Row(row), above) => table.row(row - above),
+                (Standing::Levels(levels), _) => levels.clone(),
+                (Standing::Clean, 0) => vec![0; plan.horizon],
+                (Standing::Clean, _) => table.row(table.ready().unwrap_or(0)),
             };
             let levels: Vec<usize> = batch.at.iter().flat_map(levels).collect();
-            Ok::<_, candle_core::Error>((q_sample(batch, &process, &levels)?, levels))
+            Ok::<_, candle_core::Error>((q_sample(batch, &columns, &process, &levels)?, levels))
         };
         let (seat, levels) = at(&|_| 0)?;
         // The sampler refines once a rung, at READY, and walks the rest of it with that latent.
         let rows_below = |standing: &Standing| below_ready(standing).unwrap_or(0);
         let refined_from = if batch.at.iter().any(|standing| rows_below(standing) > 0) { at(&rows_below)?.0 } else { seat.clone() };
+        let aim = aim(plan, batch, &columns, (&process, &levels))?;
         let levels = levels.iter().map(|level| *level as f32).collect();
         let ready = batch.at.iter().map(|standing| below_ready(standing).is_some()).collect();
-        Ok(Self { x: seat.x, levels, ready, refined_from })
+        Ok(Self { x: seat.x, aim, levels, ready, refined_from, columns })
+    }
+
+    /// What a network is given with it.
+    pub(super) fn given<'a>(&'a self, batch: &'a WindowBatch, latents: Option<&'a Tensor>) -> Given<'a, Tensor> {
+        Given { levels: &self.levels, latents, observed: batch.observed.as_ref(), told: batch.told.as_ref() }
     }
 }
 
+/// The columns of these of a batch that are diffused, `(B, T, D)`.
+fn diffused(steps: &Tensor, columns: &Columns) -> Result<Tensor> {
+    if steps.dim(2)? == columns.width() { Ok(steps.clone()) } else { steps.narrow(2, 0, columns.width())?.contiguous() }
+}
+
+/// What the denoiser should say at these levels.
+fn aim(plan: &Diffusion, batch: &WindowBatch, columns: &Columns, (process, levels): (&Process, &[usize])) -> Result<Tensor> {
+    let window = diffused(&batch.window, columns)?;
+    // x0 is `a x0 + b eps` with a = 1 and b = 0, and so are the others with numbers of their own.
+    let (of_x0, of_eps): (Vec<f32>, Vec<f32>) =
+        levels.iter().map(|level| (process.aim(plan.target, *level, 1.0, 0.0), process.aim(plan.target, *level, 0.0, 1.0))).unzip();
+    if plan.target == Target::X0 {
+        return Ok(window);
+    }
+    let (count, len, _) = window.dims3()?;
+    let column = |values| Tensor::from_vec(values, (count, len, 1), &Device::Cpu);
+    window.broadcast_mul(&column(of_x0)?)? + diffused(&batch.noise, columns)?.broadcast_mul(&column(of_eps)?)?
+}
+
 /// q_sample at these levels, `B * T`; the state at position 0 is the real one where it is inpainted.
-fn q_sample(batch: &WindowBatch, process: &Process, levels: &[usize]) -> Result<Seat> {
-    let ((count, len, dim), columns) = (batch.window.dims3()?, batch.columns()?);
+fn q_sample(batch: &WindowBatch, columns: &Columns, process: &Process, levels: &[usize]) -> Result<Seat> {
+    let (window, noise) = (diffused(&batch.window, columns)?, diffused(&batch.noise, columns)?);
+    let (count, len, dim) = window.dims3()?;
     let mut coefficients = [Vec::with_capacity(count * len * dim), Vec::with_capacity(count * len * dim)];
     for (index, level) in levels.iter().enumerate() {
-        let (signal, noise) = process.q_sample(*level);
+        let (of_x0, of_eps) = process.q_sample(*level);
         let known = columns.known(index % len, batch.imagined[index / len] == 0);
         for column in 0..dim {
             let kept = known.contains(&column);
-            coefficients[0].push(if kept { 1.0 } else { signal });
-            coefficients[1].push(if kept { 0.0 } else { noise });
+            coefficients[0].push(if kept { 1.0 } else { of_x0 });
+            coefficients[1].push(if kept { 0.0 } else { of_eps });
         }
     }
-    let [signal, noise] = coefficients;
+    let [of_x0, of_eps] = coefficients;
     let tensor = |values| Tensor::from_vec(values, (count, len, dim), &Device::Cpu);
     Ok(Seat {
-        x: ((tensor(signal)? * &batch.window)? + (tensor(noise)? * &batch.noise)?)?,
+        x: ((tensor(of_x0)? * &window)? + (tensor(of_eps)? * &noise)?)?,
         sigma: Tensor::from_vec(levels.iter().map(|level| process.sigma(*level)).collect::<Vec<_>>(), (count, len, 1), &Device::Cpu)?,
     })
 }
 
-/// `(B, T, D)`: 1 for each entry, more for the first action, 0 for what is inpainted; each window's weights sum to 1.
-fn loss_weights(batch: &WindowBatch, options: &RefineOptions) -> Result<Tensor> {
-    let ((count, len, dim), columns) = (batch.window.dims3()?, batch.columns()?);
+/// `(B, T, D)`: 1 for each entry, more for the first action, 0 for what is inpainted or stands clean in every row; each window's weights sum
+/// to 1.
+fn loss_weights(plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<Tensor> {
+    let (columns, first_free) = (Columns::new(plan.diffused, batch.layout()?), plan.diffused.first_free());
+    let (count, len, _) = batch.window.dims3()?;
+    let dim = columns.width();
     let mut weights = Vec::with_capacity(count * len * dim);
     for row in 0..count {
         let at = |position: usize, column: usize| match position {
-            _ if columns.known(position, batch.imagined[row] == 0).contains(&column) => 0.0,
+            _ if position < first_free || columns.known(position, batch.imagined[row] == 0).contains(&column) => 0.0,
             0 if columns.action.contains(&column) => options.first_action_weight,
+            // Of states alone the next one is what the first action comes from.
+            1 if first_free == 1 => options.first_action_weight,
             _ => 1.0,
         };
         let row: Vec<f32> = (0..len * dim).map(|index| at(index / dim, index % dim)).collect();

@@ -19,7 +19,7 @@ const STATE: usize = 3;
 fn config() -> ModelConfig {
     let layout = Layout { state_dim: STATE, action_dim: DIM - STATE };
     let latent = GruLatent::plain(4, 8, Looks::Block(3));
-    let mut config = ModelConfig::plain(layout, Some(latent), Backbone::Dit { width: 16, depth: 1, heads: 2 });
+    let mut config = ModelConfig::plain(layout, Some(latent), Backbone::dit(16, 1, 2));
     (config.method.plan.horizon, config.method.plan.level_max) = (LEN, 20);
     config
 }
@@ -50,6 +50,9 @@ fn batch(window: Vec<f32>, noise: Vec<f32>, row: usize) -> WindowBatch {
         at: vec![Standing::Row(row); BATCH],
         imagined: vec![0; BATCH],
         noise: tensor(noise),
+        told: None,
+        truth: None,
+        returns: None,
     }
 }
 
@@ -63,7 +66,7 @@ fn latents(networks: &Networks, batch: &WindowBatch, routing: LatentRouting) -> 
 /// Another clean window with the same current state, and noise chosen so that at `row` the first `kept` positions look the same.
 fn perturbed(window: &[f32], noise: &[f32], row: usize, kept: usize) -> (Vec<f32>, Vec<f32>) {
     let (other, process) = (values(77), Process::cosine(20));
-    let levels = Table::new(Schedule::Ladder, LEN, 1, 20).unwrap().row(row);
+    let levels = Table::new(Schedule::LADDER, [0, LEN], 1, 20).unwrap().row(row);
     let (mut window, mut noise) = (window.to_vec(), noise.to_vec());
     for index in 0..window.len() {
         let (position, column) = (index / DIM % LEN, index % DIM);
@@ -116,7 +119,7 @@ fn loss_is_the_weighted_mean_square() {
     let batch = batch(values(1), values(2), 2);
     let options = options(LatentRouting::Matched);
     let noised = Noised::new(&config.method.plan, &batch, &options).unwrap();
-    let condition = Given { levels: &noised.levels, latents: None, observed: None };
+    let condition = Given { levels: &noised.levels, latents: None, observed: None, told: None };
     let x0: Vec<f32> = networks.denoiser.predict(&noised.x, &condition).unwrap().flatten_all().unwrap().to_vec1().unwrap();
     let (mut sum, mut weight) = (0.0, 0.0);
     for (index, (x0, clean)) in x0.iter().zip(values(1)).enumerate() {

@@ -3,7 +3,7 @@
 use candle_core::{Result, Tensor};
 
 /// Bounds of a latent's log-variance.
-pub(super) const LOG_VAR: (f32, f32) = (-8.0, 2.0);
+pub const LOG_VAR: (f32, f32) = (-8.0, 2.0);
 
 /// A diagonal Gaussian; both values have the same shape, the last dimension being the latent's.
 #[derive(Clone, Debug)]

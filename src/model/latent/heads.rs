@@ -85,6 +85,14 @@ impl Decoder {
         self.layout
     }
 
+    /// The reward alone, `(.., 1)`; see [`Self::predict`].
+    ///
+    /// # Errors
+    /// If widths differ.
+    pub fn reward<V: Activations>(&self, state: &V, action: &V, latent: &V) -> Result<V> {
+        self.reward.forward(&V::beside(&[state, action, latent])?)
+    }
+
     /// From `(.., state_dim)`, `(.., action_dim)`, `(.., dim)`; of the action only what needs to be known is looked at.
     ///
     /// # Errors

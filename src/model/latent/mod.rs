@@ -11,7 +11,7 @@ mod tokens;
 pub use baseline::{Baseline, ContextFreeTerms, WHITENERS};
 pub use encoder::Encoder;
 pub use evidence::Evidence;
-pub use gaussian::{Gaussian, GaussianRef, hold_within};
+pub use gaussian::{Gaussian, GaussianRef, LOG_VAR, hold_within};
 pub use heads::{Decoder, Prior, Told};
 pub use tokens::{Before, Surprises, Tokens};
 

@@ -121,6 +121,33 @@ pub trait Activations: Clone {
         self.run(&Layer::plain(Op::Flatten), &[])
     }
 
+    /// One step of many channels as so many steps: `(batch, 1, steps channels)` to `(batch, steps, channels)`.
+    ///
+    /// # Errors
+    /// If there are several steps, or the channels cannot be parted so.
+    fn unflattened(&self, steps: usize) -> Result<Self> {
+        self.run(&Layer::plain(Op::Unflatten { steps }), &[])
+    }
+
+    /// The steps of `self`, and those of `later` behind them.
+    ///
+    /// # Errors
+    /// If the other dimensions differ.
+    fn followed_by(&self, later: &Self) -> Result<Self> {
+        let ([_, first, _], [_, second, _]) = (self.shape()?, later.shape()?);
+        Self::beside(&[&self.flattened()?, &later.flattened()?])?.unflattened(first + second)
+    }
+
+    /// The last `len` steps.
+    ///
+    /// # Errors
+    /// If there are not so many.
+    fn last_steps(&self, len: usize) -> Result<Self> {
+        let [_, steps, channels] = self.shape()?;
+        let Some(before) = steps.checked_sub(len) else { bail!("{len} steps of {steps}") };
+        self.flattened()?.channels(before * channels, len * channels)?.unflattened(len)
+    }
+
     /// `self - other`.
     ///
     /// # Errors

@@ -18,6 +18,8 @@ pub struct Given<'a, V> {
     pub latents: Option<&'a V>,
     /// `(B, 1, (T_o - 1) * (state_dim + action_dim))` real steps, for models with `obs_horizon > 1`.
     pub observed: Option<&'a V>,
+    /// `(B, 1, told_width + 1)` what is told of what is wanted, normalized, and 1; zeros where nothing is told. For models that take it.
+    pub told: Option<&'a V>,
 }
 
 /// The level of each position, as channels of it.

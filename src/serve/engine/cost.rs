@@ -1,6 +1,11 @@
-//! What a tick costs: measured at warm-up for every batch length, so that an act with a deadline can be told how many it may still take.
+//! What a tick costs: measured at warm-up for every batch length, so that an act with a deadline can be told how many it may still take. More rows
+//! than were measured cost in proportion.
 
-use crate::model::agent::{Act, Agent, AgentError, Observation};
+use crate::model::{
+    agent::{Act, Agent, AgentError, Observation},
+    normalizer::Affine,
+    options::SamplerOptions,
+};
 use parking_lot::RwLock;
 use std::{
     sync::{Arc, Weak},
@@ -34,12 +39,35 @@ impl Tariff {
     }
 }
 
+/// What takes part in a tick.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Load {
+    /// Acts.
+    pub acts: usize,
+    /// Their rows together ([`Act::rows`]).
+    pub rows: usize,
+}
+
+impl Load {
+    /// These acts, or as many of them as have room in so many rows.
+    pub fn of(acts: &[Act], rows_max: usize) -> Self {
+        let rows = acts.iter().map(Act::rows);
+        let largest = rows.clone().max().unwrap_or(0);
+        Self { acts: acts.len(), rows: rows.sum() }.within(rows_max, largest)
+    }
+
+    /// As much of it as has room in so many rows, or in those of an act that has more.
+    pub fn within(self, rows_max: usize, largest: usize) -> Self {
+        Self { acts: self.acts.min(rows_max), rows: self.rows.min(rows_max.max(largest)) }
+    }
+}
+
 /// Costs of one model on one worker.
 #[derive(Debug)]
 pub(super) struct Costs {
     /// A tick of acts on their way, by rows from 1.
     ticks: Vec<Duration>,
-    /// What the first tick costs more: latents and their prior chain.
+    /// What the first tick costs more, by acts from 1: latents and their prior chain, which all rows of an act share.
     starts: Vec<Duration>,
 }
 
@@ -67,27 +95,32 @@ impl Costs {
         Ok(costs)
     }
 
-    /// A tick of `len` rows, with the start of `fresh` among them.
-    pub fn tick(&self, len: usize, fresh: usize) -> Duration {
-        of(&self.ticks, len) + if fresh > 0 { of(&self.starts, fresh) } else { Duration::ZERO }
+    /// A tick of so many rows, with the start of `fresh` acts among them.
+    pub fn tick(&self, rows: usize, fresh: usize) -> Duration {
+        of(&self.ticks, rows) + if fresh > 0 { of(&self.starts, fresh) } else { Duration::ZERO }
     }
 
-    /// A whole act of so many evaluations in a batch of `len`.
-    pub fn act(&self, evaluations: usize, len: usize) -> Duration {
-        self.tick(len, 0) * u32::try_from(evaluations).unwrap_or(u32::MAX) + of(&self.starts, len)
+    /// So many ticks of these rows.
+    pub fn ticks(&self, ticks: usize, rows: usize) -> Duration {
+        self.tick(rows, 0) * u32::try_from(ticks).unwrap_or(u32::MAX)
     }
 
-    /// What of a worker's time an act of so many evaluations takes when its batch is full.
-    pub fn share(&self, evaluations: usize) -> Duration {
+    /// A whole act of so many forwards in this company, which is its own too.
+    pub fn act(&self, forwards: usize, load: Load) -> Duration {
+        self.ticks(forwards, load.rows) + of(&self.starts, load.acts)
+    }
+
+    /// What of a worker's time an act of so many forwards and rows takes when its batch is full.
+    pub fn share(&self, forwards: usize, rows: usize) -> Duration {
         let len = self.ticks.len().max(1);
-        self.act(evaluations, len) / len as u32
+        (self.ticks(forwards, len) * u32::try_from(rows).unwrap_or(u32::MAX) + of(&self.starts, len)) / len as u32
     }
 
-    /// Ticks of `len` acts that fit into `left` for one that has started or not, if each waits for `others` too and everything takes
+    /// Ticks in this company that fit into `left` for one that has started or not, if each waits for `others` too and everything takes
     /// `slowness` times as long as it did at warm-up.
-    pub fn ticks_within(&self, left: Duration, (len, started): (usize, bool), others: Duration, slowness: f64) -> usize {
-        let start = if started { Duration::ZERO } else { of(&self.starts, len) };
-        let tick = (self.tick(len, 0) + others).as_secs_f64();
+    pub fn ticks_within(&self, left: Duration, (load, started): (Load, bool), others: Duration, slowness: f64) -> usize {
+        let start = if started { Duration::ZERO } else { of(&self.starts, load.acts) };
+        let tick = (self.tick(load.rows, 0) + others).as_secs_f64();
         let left = left.as_secs_f64() - slowness * start.as_secs_f64();
         (left / (slowness * tick).max(1e-9)).max(0.0) as usize
     }
@@ -123,8 +156,10 @@ impl Slowness {
     }
 }
 
+/// What so many cost: as measured, and in proportion beyond the most that were.
 fn of(costs: &[Duration], len: usize) -> Duration {
-    costs.get(len.max(1) - 1).or(costs.last()).copied().unwrap_or(Duration::ZERO)
+    let beyond = || costs.last().map_or(Duration::ZERO, |last| last.mul_f64(len as f64 / costs.len() as f64));
+    costs.get(len.max(1) - 1).copied().unwrap_or_else(beyond)
 }
 
 fn timed(work: impl FnOnce() -> Result<(), AgentError>) -> Result<Duration, AgentError> {
@@ -133,17 +168,33 @@ fn timed(work: impl FnOnce() -> Result<(), AgentError>) -> Result<Duration, Agen
     Ok(begin.elapsed())
 }
 
-/// First acts of as many sessions, within what the model knows: one standard deviation off the mean.
+/// First acts of as many sessions, of one row each, within what the model knows: one standard deviation off the mean.
 fn acts(agent: &Agent, len: usize) -> Result<Vec<Act>, AgentError> {
-    let known = &agent.config().units.normalizer.state;
-    let observation = Observation { state: known.denormalize(&vec![1.0; known.mean.len()]), ..Observation::default() };
-    let begin = |seed| agent.begin(&agent.open(seed, &agent.spec().sampler)?, &observation);
+    let (units, options) = (&agent.config().units, of_one_row(&agent.spec().sampler));
+    let off = |known: &Affine| known.denormalize(&vec![1.0; known.dim()]);
+    let context = units.context.as_ref().map(|context| vec![off(context)]);
+    let observation = Observation { state: off(&units.normalizer.state), context, ..Observation::default() };
+    let begin = |seed| agent.begin(&agent.open(seed, &options)?, &observation);
     (0..len as u64).map(begin).collect()
+}
+
+/// These options, but for what makes an act of several rows, or lets a guide lead it: then rows are acts, whatever a checkpoint's defaults are.
+fn of_one_row(options: &SamplerOptions) -> SamplerOptions {
+    SamplerOptions {
+        guidance_scale: 0.0,
+        guidance_samples: 0,
+        free_guidance_scale: 1.0,
+        candidates: 1,
+        picard_window: 1,
+        ..options.clone()
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::checkpoint;
+    use std::path::Path;
 
     fn ms(ms: u64) -> Duration {
         Duration::from_millis(ms)
@@ -152,16 +203,50 @@ mod tests {
     #[test]
     fn ticks_that_fit() {
         let costs = Costs { ticks: vec![ms(2), ms(3)], starts: vec![ms(4), ms(5)] };
-        let within = |left, len, started, others, slowness| costs.ticks_within(ms(left), (len, started), ms(others), slowness);
+        let alike = |len| Load { acts: len, rows: len };
+        let within = |left, len, started, others, slowness| costs.ticks_within(ms(left), (alike(len), started), ms(others), slowness);
         assert_eq!(within(9, 1, true, 0, 1.0), 4);
         assert_eq!(within(9, 1, false, 0, 1.0), 2);
         assert_eq!(within(9, 1, true, 0, 2.0), 2);
         assert_eq!(within(9, 1, true, 2, 1.0), 2);
-        assert_eq!(within(10, 7, true, 0, 1.0), 3, "the longest that was measured");
         assert_eq!(within(3, 1, false, 0, 1.0), 0);
         assert_eq!(costs.tick(2, 1), ms(7));
-        assert_eq!((costs.act(3, 1), costs.act(3, 9)), (ms(10), ms(14)));
-        assert_eq!(costs.share(3), ms(7), "of a full batch");
+        assert_eq!((costs.act(3, alike(1)), costs.act(3, alike(2))), (ms(10), ms(14)));
+        assert_eq!(costs.share(3, 1), ms(7), "of a full batch");
+    }
+
+    /// An act of 64 candidates in a batch of two was taken to cost as much as one of two.
+    #[test]
+    fn more_rows_than_were_measured_cost_in_proportion() {
+        let costs = Costs { ticks: vec![ms(2), ms(3)], starts: vec![ms(4), ms(5)] };
+        let wide = Load { acts: 1, rows: 64 };
+        assert_eq!((costs.tick(64, 0), costs.tick(64, 1)), (ms(96), ms(100)), "its latents are inferred once");
+        assert_eq!((costs.act(3, wide), costs.ticks(3, 64)), (ms(292), ms(288)));
+        assert_eq!(costs.ticks_within(ms(293), (wide, false), Duration::ZERO, 1.0), 3);
+        assert_eq!(costs.ticks_within(ms(291), (wide, false), Duration::ZERO, 1.0), 2);
+        assert_eq!(costs.share(4, 64), ms(6) * 64 + ms(5) / 2);
+        assert_eq!(Costs { ticks: vec![], starts: vec![] }.act(3, wide), Duration::ZERO, "nothing was measured");
+    }
+
+    /// Whatever a checkpoint's defaults are, a row is measured as a row.
+    #[test]
+    fn warm_up_measures_acts_of_one_row() {
+        let agent = checkpoint::load(Path::new("models/tiny")).unwrap();
+        let mut config = agent.config().clone();
+        config.defaults.sampler.picard_window = 4;
+        let out = tempfile::tempdir().unwrap();
+        checkpoint::copy_with(Path::new("models/tiny"), out.path(), &config).unwrap();
+        let agent = checkpoint::load(out.path()).unwrap();
+        assert_eq!(agent.spec().sampler.picard_window, 4);
+        assert!(acts(&agent, 3).unwrap().iter().all(|act| act.rows() == 1));
+        let wild = SamplerOptions {
+            guidance_scale: 2.0,
+            guidance_samples: 3,
+            free_guidance_scale: 1.5,
+            candidates: 9,
+            ..agent.spec().sampler.clone()
+        };
+        assert_eq!((of_one_row(&wild).rows_max(), of_one_row(&wild).guidance_scale), (1, 0.0));
     }
 
     #[test]

@@ -13,7 +13,7 @@ mod turns;
 mod worker;
 
 use crate::model::agent::{Act, Agent, AgentError, Chunk, Episode, Observation};
-use cost::Tariff;
+use cost::{Load, Tariff};
 use parking_lot::Mutex;
 use queue::{Ask, Bounds, Place, Queue};
 use std::{
@@ -72,6 +72,11 @@ impl Question {
     /// If the observation does not fit the model.
     pub fn begin(&self, agent: &Agent) -> Result<Act, AgentError> {
         agent.begin(&self.episode, &self.observation)
+    }
+
+    /// Forwards that its act still asks for, if every guess of rows that are evaluated at once is borne out.
+    fn forwards_left(&self, act: &Act) -> usize {
+        act.evaluations_left().div_ceil(self.episode.options().picard_window.max(1))
     }
 }
 
@@ -274,20 +279,23 @@ impl<T: Ticket> Shared<T> {
     /// What an act asks of the queue; None: it would come too late without any wait. Of a model that was never measured nothing is known.
     fn ask(&self, job: &Job<T>) -> Option<Ask> {
         let bytes = size_of::<Job<T>>() + job.question.observation.size_bytes() + job.act.size_bytes();
-        let ask =
-            Ask { turn_by: job.turn_by, client: job.client, work: Duration::ZERO, bytes, wait_max: Duration::MAX, useful: Duration::MAX };
+        let (rows, rows_max) = (job.act.rows(), self.options.batch_len_max);
+        let (work, wait_max, useful) = (Duration::ZERO, Duration::MAX, Duration::MAX);
+        let ask = Ask { turn_by: job.turn_by, client: job.client, rows, work, bytes, wait_max, useful };
         let Some(costs) = self.tariff.of(&job.agent) else { return Some(ask) };
-        let (evaluations, patience) = (job.act.evaluations_left(), job.ticket.patience());
+        let (forwards, patience) = (job.question.forwards_left(&job.act), job.ticket.patience());
         let ((waiting, running), slowness) = (self.queue.load(), self.queue.slowness());
-        let batch = ((waiting + running) / self.options.workers + 1).min(self.options.batch_len_max);
+        let others = (waiting + running) / self.options.workers;
+        let batch = Load { acts: others + 1, rows: others + rows }.within(rows_max, rows);
         // One that may be degraded needs time for a single evaluation.
-        let least = costs.act(if patience.due.is_some() { 1 } else { evaluations }, batch).mul_f64(slowness);
+        let least = costs.act(if patience.due.is_some() { 1 } else { forwards }, batch).mul_f64(slowness);
         let left = patience.ends.map(|ends| ends.saturating_duration_since(Instant::now()));
-        // And takes no more than it has, which it shares with a full batch.
-        let hurried = patience.due.and(left).map(|left| left / self.options.batch_len_max as u32);
+        // And takes no more than it has, of which its rows have their share of a full batch.
+        let hurried = patience.due.and(left).map(|left| left * rows.min(rows_max) as u32 / rows_max as u32);
+        let full = Load { acts: rows_max, rows: rows_max.max(rows) };
         Some(Ask {
-            work: costs.share(evaluations).min(hurried.unwrap_or(Duration::MAX)),
-            wait_max: self.options.wait_max.max(costs.act(evaluations, self.options.batch_len_max) * WAIT_ACTS),
+            work: costs.share(forwards, rows).min(hurried.unwrap_or(Duration::MAX)),
+            wait_max: self.options.wait_max.max(costs.act(forwards, full) * WAIT_ACTS),
             useful: left.map_or(Some(Duration::MAX), |left| left.checked_sub(least))?,
             ..ask
         })

@@ -49,6 +49,8 @@ pub(super) struct Ask {
     pub turn_by: Instant,
     /// Whose it is.
     pub client: u64,
+    /// Of a batch.
+    pub rows: usize,
     /// Of a worker's time.
     pub work: Duration,
     /// Memory.
@@ -59,7 +61,7 @@ pub(super) struct Ask {
     pub useful: Duration,
 }
 
-/// How many jobs a worker takes.
+/// How many rows a worker takes.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Room {
     /// Of any client.
@@ -99,6 +101,7 @@ struct Inner<J> {
 
 struct Waiting<J> {
     client: u64,
+    rows: usize,
     work: Duration,
     bytes: usize,
     job: J,
@@ -166,6 +169,21 @@ impl<J> Inner<J> {
         self.remove(&place)
     }
 
+    /// Rows of the first one.
+    fn first_rows(&self) -> Option<usize> {
+        self.jobs.first_key_value().map(|(_, waiting)| waiting.rows)
+    }
+
+    /// Those of light clients that fit into so many rows.
+    fn light(&self, mut rows: usize, is_heavy: impl Fn(u64) -> bool) -> Vec<Place> {
+        let mut fits = |waiting: &Waiting<J>| {
+            let fits = waiting.rows <= rows && !is_heavy(waiting.client);
+            rows -= if fits { waiting.rows } else { 0 };
+            fits
+        };
+        self.jobs.iter().take(LOOKS_MAX).filter(|(_, waiting)| fits(waiting)).map(|(place, _)| *place).collect()
+    }
+
     /// Whether one who has its turn then is to wait for no longer than it may: counts only as much of the work before it as decides that.
     fn admits(&self, turn: Instant, ask: &Ask) -> Result<(), Refusal> {
         let wait_max = ask.wait_max.min(ask.useful);
@@ -228,7 +246,7 @@ impl<J> Queue<J> {
         inner.bytes += ask.bytes;
         *inner.clients.entry(ask.client).or_default() += ask.work;
         let place = (turn, inner.arrivals);
-        inner.jobs.insert(place, Waiting { client: ask.client, work: ask.work, bytes: ask.bytes, job });
+        inner.jobs.insert(place, Waiting { client: ask.client, rows: ask.rows, work: ask.work, bytes: ask.bytes, job });
         self.ready.notify_one();
         Ok((place, displaced))
     }
@@ -238,8 +256,9 @@ impl<J> Queue<J> {
         self.inner.lock().remove(&place).map(|waiting| waiting.job)
     }
 
-    /// Jobs for a worker that holds `held` jobs now and has `room` for more; None: the end. Waits only if it holds none. A client that
-    /// holds much of the batch (`is_heavy`) does not take the places that are kept for others.
+    /// Jobs for a worker that holds `held` jobs now and has `room` for more; None: the end. Waits only if it holds none. The first one waits
+    /// until it has room, and nobody overtakes it; one of more rows than there ever can be is taken alone. A client that holds much of the batch
+    /// (`is_heavy`) does not take the places that are kept for others.
     pub fn take(&self, worker: usize, held: usize, room: Room, is_heavy: impl Fn(u64) -> bool) -> Option<Vec<J>> {
         let mut inner = self.inner.lock();
         inner.running[worker] = held;
@@ -251,11 +270,18 @@ impl<J> Queue<J> {
         }
         // An even share: with two workers and four acts, two batches of two end sooner than one of four.
         let share = (inner.running.iter().sum::<usize>() + inner.jobs.len()).div_ceil(inner.running.len());
-        let count = share.saturating_sub(held).min(room.any).min(inner.jobs.len());
-        let mut taken: Vec<_> = std::iter::from_fn(|| inner.pop()).take(count).collect();
-        if count == room.any && room.light > 0 {
-            let light = inner.jobs.iter().take(LOOKS_MAX).filter(|(_, waiting)| !is_heavy(waiting.client));
-            let places: Vec<_> = light.map(|(place, _)| *place).take(room.light).collect();
+        let count = share.saturating_sub(held);
+        let (mut taken, mut left) = (Vec::new(), room.any);
+        while taken.len() < count
+            && let Some(rows) = inner.first_rows()
+            && (rows <= left || held == 0 && taken.is_empty() && left > 0)
+        {
+            taken.extend(inner.pop());
+            left = left.saturating_sub(rows);
+        }
+        let is_full = left == 0 || taken.len() < count && !inner.jobs.is_empty();
+        if is_full && room.light > 0 {
+            let places = inner.light(room.light, is_heavy);
             taken.extend(places.iter().filter_map(|place| inner.remove(place)));
         }
         inner.running[worker] += taken.len();

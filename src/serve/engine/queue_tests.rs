@@ -10,7 +10,7 @@ fn ms(ms: u64) -> Duration {
 
 /// Of client 0, with a turn at `turn_by`, and no wish beyond that.
 fn ask(turn_by: Instant, bytes: usize) -> Ask {
-    Ask { turn_by, client: 0, work: Duration::ZERO, bytes, wait_max: Duration::MAX, useful: Duration::MAX }
+    Ask { turn_by, client: 0, rows: 1, work: Duration::ZERO, bytes, wait_max: Duration::MAX, useful: Duration::MAX }
 }
 
 impl Queue<i32> {
@@ -150,6 +150,27 @@ fn places_are_kept_for_the_light() {
     assert_eq!(queue.take(0, 8, room(0, 0), heavy), Some(vec![]));
     assert_eq!(queue.take(0, 0, room(1, 2), heavy), Some(vec![0, 5]));
     assert_eq!(queue.take(0, 0, room(9, 2), heavy), Some(vec![1, 3]));
+}
+
+/// A batch holds so many rows, and not so many acts: one of many rows waits until they are free, nobody overtakes it meanwhile, and one of more
+/// than there ever are is taken alone. Once 64 acts of 64 candidates were taken into one batch of 64.
+#[test]
+fn room_is_counted_in_rows() {
+    let (queue, now) = (queue(99, 1), Instant::now());
+    for (job, rows) in [(0, 3), (1, 4), (2, 2), (3, 1), (4, 100), (5, 1)] {
+        queue.put(job, Ask { rows, client: job as u64, ..ask(now, 1) }).unwrap();
+    }
+    assert_eq!(queue.take_any(0, 0, 8), Some(vec![0, 1]));
+    assert_eq!(queue.take_any(0, 2, 1), Some(vec![]), "nobody overtakes");
+    assert_eq!(queue.take_any(0, 1, 4), Some(vec![2, 3]));
+    assert_eq!(queue.take_any(0, 1, 7), Some(vec![]), "it is larger than any room");
+    assert_eq!(
+        queue.take(0, 1, Room { any: 7, light: 2 }, |_| false),
+        Some(vec![5]),
+        "others still find the places that are kept for them"
+    );
+    assert_eq!(queue.take_any(0, 0, 8), Some(vec![4]), "alone");
+    assert_eq!(queue.load(), (0, 1));
 }
 
 /// After a hiccup the pace is slow, and if it counted while nobody waits, acts would be refused that nothing would ever measure again.

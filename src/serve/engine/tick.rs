@@ -2,7 +2,7 @@
 
 use super::{
     EngineOptions, Failure, Finished, Job, Patience, Question, Ticket,
-    cost::{Costs, Slowness, Tariff},
+    cost::{Costs, Load, Slowness, Tariff},
     turns::{Part, Turns},
 };
 use crate::model::agent::{Act, Agent, AgentError, Chunk, Episode};
@@ -36,6 +36,8 @@ struct Pace {
     others: Duration,
     /// Time kept for what follows the last evaluation.
     margin: Duration,
+    /// Rows of a tick.
+    rows_max: usize,
 }
 
 /// In which order acts find room in a tick.
@@ -84,16 +86,18 @@ impl<T: Ticket> Batch<T> {
         Ok(())
     }
 
-    /// Takes an act into a batch that will have this length; it takes part from the next tick on. One that would come too late is not begun.
-    pub fn admit(&mut self, job: Job<T>, len: usize, tariff: &Tariff) {
+    /// Takes an act into a batch that will hold so many acts and rows; it takes part from the next tick on. One that would come too late is not
+    /// begun.
+    pub fn admit(&mut self, job: Job<T>, held: Load, tariff: &Tariff) {
         let Job { agent, question, act, ticket, submitted, turn_by: _, client } = job;
         if !ticket.is_wanted() {
             return;
         }
         let (slowness, margin, idle) = (self.slowness.get(), self.options.deadline_margin, self.len() == 0);
+        let load = held.within(self.options.batch_len_max, act.rows());
         let group = self.group(agent, tariff);
         if let Some(costs) = &group.costs {
-            let needs = costs.act(act.evaluations_left(), len).mul_f64(slowness);
+            let needs = costs.act(question.forwards_left(&act), load).mul_f64(slowness);
             if is_late(ticket.patience(), needs, margin) {
                 // It tells nothing about the machine, and if nobody else is computed nothing would. While others are, they tell: to forget
                 // for each of a crowd that is late would let the next ones in that are late too.
@@ -110,21 +114,22 @@ impl<T: Ticket> Batch<T> {
 
     /// Clients that hold much of it, and places beyond it that are kept for the others.
     pub fn turns(&mut self) -> &Turns {
-        self.turns.count(self.groups.iter().flat_map(|group| &group.riders).map(|rider| rider.client));
+        let acts = self.groups.iter().flat_map(|group| group.riders.iter().zip(&group.acts));
+        self.turns.count(acts.map(|(rider, act)| (rider.client, act.rows())));
         &self.turns
     }
 
     /// One evaluation for every act whose client has its turn; those that are done leave.
     pub fn tick(&mut self) {
-        let expected: Duration = self.groups.iter().map(Group::expected).sum();
-        let (margin, len_max) = (self.options.deadline_margin, self.options.batch_len_max);
-        let full = |group: &Group<T>| group.costs.as_ref().map(|costs| costs.tick(len_max, 0));
+        let (margin, rows_max) = (self.options.deadline_margin, self.options.batch_len_max);
+        let expected: Duration = self.groups.iter().map(|group| group.expected(rows_max)).sum();
+        let full = |group: &Group<T>| group.costs.as_ref().map(|costs| costs.tick(rows_max, 0));
         let credit = self.groups.iter().filter_map(full).max().unwrap_or_default();
         let (part, begin) = (self.turns().part(credit), Instant::now());
         for group in &mut self.groups {
-            let others = expected.saturating_sub(group.expected());
-            let pace = Pace { others, margin };
-            group.tick(&mut self.slowness, pace, len_max, |client| match (self.turns.is_heavy(client), part) {
+            let others = expected.saturating_sub(group.expected(rows_max));
+            let pace = Pace { others, margin, rows_max };
+            group.tick(&mut self.slowness, pace, |client| match (self.turns.is_heavy(client), part) {
                 (false, _) => Some(Order::First),
                 (true, Part::All) => Some(Order::Then),
                 (true, Part::Light) => None,
@@ -165,15 +170,15 @@ impl<T: Ticket> Batch<T> {
 }
 
 impl<T: Ticket> Group<T> {
-    fn tick(&mut self, slowness: &mut Slowness, pace: Pace, rows_max: usize, order: impl Fn(u64) -> Option<Order>) {
+    fn tick(&mut self, slowness: &mut Slowness, pace: Pace, order: impl Fn(u64) -> Option<Order>) {
         self.drop_unwanted();
         self.hurry(slowness, pace);
         self.harvest();
-        let len = self.line_up(rows_max, order);
+        let len = self.line_up(pace.rows_max, order);
         if len == 0 {
             return;
         }
-        let (begin, expected) = (Instant::now(), self.expected_of(len));
+        let (begin, expected) = (Instant::now(), self.expected_of(len, pace.rows_max));
         if advance(&self.agent, &mut self.acts[..len]).is_err() {
             // Whose fault it was is unknown, and the acts may be half advanced: each act starts again, alone.
             self.acts.drain(..len).for_each(|act| count_waste(&act));
@@ -205,22 +210,23 @@ impl<T: Ticket> Group<T> {
         len
     }
 
-    /// What a tick of everyone would have taken at warm-up.
-    fn expected(&self) -> Duration {
-        self.expected_of(self.riders.len())
+    /// What a tick of everyone who has room would have taken at warm-up.
+    fn expected(&self, rows_max: usize) -> Duration {
+        self.expected_of(self.riders.len(), rows_max)
     }
 
     /// The same of the first ones.
-    fn expected_of(&self, len: usize) -> Duration {
-        let rows = |fresh: bool| self.acts[..len].iter().filter(|act| !fresh || act.evaluations() == 0).map(Act::rows).sum();
-        self.costs.as_ref().map_or(Duration::ZERO, |costs| costs.tick(rows(false), rows(true)))
+    fn expected_of(&self, len: usize, rows_max: usize) -> Duration {
+        let acts = &self.acts[..len];
+        let fresh = acts.iter().filter(|act| act.evaluations() == 0).count();
+        self.costs.as_ref().map_or(Duration::ZERO, |costs| costs.tick(Load::of(acts, rows_max).rows, fresh))
     }
 
     /// Tells acts in a hurry how many evaluations they have time for; one that has time for none gives out what it has.
     fn hurry(&mut self, slowness: &mut Slowness, pace: Pace) {
         let Some(costs) = &self.costs else { return };
         for i in (0..self.riders.len()).rev() {
-            let batch = (costs.as_ref(), self.riders.len(), slowness.get());
+            let batch = (costs.as_ref(), Load::of(&self.acts, pace.rows_max), slowness.get());
             match self.riders[i].hurry(&self.agent, &mut self.acts[i], batch, pace) {
                 Ok(Hurry::Cut) => slowness.forget(),
                 Ok(Hurry::Goes) => {}
@@ -256,17 +262,17 @@ impl<T: Ticket> Group<T> {
 }
 
 impl<T: Ticket> Rider<T> {
-    /// See [`Group::hurry`]; the batch is its costs, length and slowness.
-    fn hurry(&self, agent: &Agent, act: &mut Act, batch: (&Costs, usize, f64), pace: Pace) -> Result<Hurry, Failure> {
-        let (patience, (costs, len, slowness)) = (self.ticket.patience(), batch);
+    /// See [`Group::hurry`]; the batch is its costs, what is in it, and its slowness.
+    fn hurry(&self, agent: &Agent, act: &mut Act, batch: (&Costs, Load, f64), pace: Pace) -> Result<Hurry, Failure> {
+        let (patience, (costs, load, slowness)) = (self.ticket.patience(), batch);
         let Some(due) = patience.due else {
             act.allow(None);
             // In the best case; what was computed already is lost with it.
-            let needs = costs.tick(len, 0) * act.evaluations_left() as u32;
+            let needs = costs.ticks(self.question.forwards_left(act), load.rows);
             return Ok(if is_late(patience, needs, Duration::ZERO) { Hurry::Late } else { Hurry::Goes });
         };
         let left = due.saturating_duration_since(Instant::now()).saturating_sub(pace.margin);
-        let ticks = costs.ticks_within(left, (len, act.evaluations() > 0), pace.others, slowness);
+        let ticks = costs.ticks_within(left, (load, act.evaluations() > 0), pace.others, slowness);
         if ticks == 0 && guarded(|| Ok(agent.cut_short(act)))? {
             return Ok(Hurry::Cut);
         }
@@ -284,11 +290,13 @@ impl<T: Ticket> Rider<T> {
             if !self.ticket.is_wanted() {
                 return count_waste(&act);
             }
-            let hurried = costs.map_or(Ok(Hurry::Goes), |costs| self.hurry(agent, &mut act, (costs, 1, 1.0), pace));
+            let load = Load { acts: 1, rows: act.rows() };
+            let hurried = costs.map_or(Ok(Hurry::Goes), |costs| self.hurry(agent, &mut act, (costs, load, 1.0), pace));
             let advanced = hurried.and_then(|hurry| match hurry {
-                Hurry::Goes => advance(agent, std::slice::from_mut(&mut act)),
-                Hurry::Cut => Ok(()),
                 Hurry::Late => Err(Failure::Late),
+                Hurry::Cut if act.is_done() => Ok(()),
+                // A plan that was cut short may still ask for its actions, or to be chosen: that is answered, and brings it to its end.
+                Hurry::Cut | Hurry::Goes => advance(agent, std::slice::from_mut(&mut act)),
             });
             if let Err(failure) = advanced {
                 count_waste(&act);
@@ -351,104 +359,5 @@ fn guarded<R>(work: impl FnOnce() -> Result<R, AgentError>) -> Result<R, Failure
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::model::{agent::Observation, checkpoint};
-    use std::{path::Path, sync::mpsc};
-
-    #[test]
-    fn rows_bound_a_tick() {
-        assert!(has_room(0, 1, 2) && has_room(1, 1, 2) && !has_room(2, 1, 2));
-        assert!(!has_room(1, 2, 2) && has_room(0, 64, 2), "too many for any tick is not for ever");
-    }
-
-    /// Waits until the time is over, and says what came of it.
-    struct Waits(Instant, mpsc::Sender<Result<Finished, Failure>>);
-
-    impl Ticket for Waits {
-        fn is_wanted(&self) -> bool {
-            true
-        }
-
-        fn start(&self) {}
-
-        fn patience(&self) -> Patience {
-            Patience { due: None, ends: Some(self.0) }
-        }
-
-        fn settle(self, outcome: Result<Finished, Failure>) {
-            self.1.send(outcome).unwrap();
-        }
-    }
-
-    /// A worker that was four times as slow as at warm-up, and what became of acts offered to it.
-    struct Slow {
-        agent: Arc<Agent>,
-        batch: Batch<Waits>,
-        tariff: Tariff,
-        told: mpsc::Sender<Result<Finished, Failure>>,
-        outcomes: mpsc::Receiver<Result<Finished, Failure>>,
-    }
-
-    impl Slow {
-        fn new() -> Self {
-            let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
-            let options = EngineOptions {
-                workers: 1,
-                queue_len_max: 1,
-                queue_bytes_max: 1,
-                batch_len_max: 2,
-                deadline_margin: Duration::ZERO,
-                wait_max: Duration::ZERO,
-            };
-            let (mut batch, tariff) = (Batch::new(options), Tariff::default());
-            batch.warm_up(&agent, &tariff, || true).unwrap();
-            (0..100).for_each(|_| batch.slowness.note(Duration::from_secs(1), Duration::from_millis(1)));
-            let (told, outcomes) = mpsc::channel();
-            Self { agent, batch, tariff, told, outcomes }
-        }
-
-        /// Offers an act whose caller waits so long, or for twice what it takes, and so half of what it would take at this slowness.
-        fn offer(&mut self, patience: Option<Duration>) {
-            let question = Question {
-                episode: Arc::new(self.agent.open(1, &self.agent.spec().sampler).unwrap()),
-                observation: Observation { state: vec![0.1; 4], ..Observation::default() },
-            };
-            let act = question.begin(&self.agent).unwrap();
-            let needs = self.tariff.of(&self.agent).unwrap().act(act.evaluations_left(), 1);
-            let now = Instant::now();
-            let ticket = Waits(now + patience.unwrap_or(2 * needs + Duration::from_micros(200)), self.told.clone());
-            let job = Job { agent: self.agent.clone(), question, act, ticket, submitted: now, turn_by: now, client: 0 };
-            self.batch.admit(job, 1, &self.tariff);
-        }
-
-        /// Acts that were too late since it was last asked.
-        fn late(&self) -> usize {
-            self.outcomes.try_iter().filter(|outcome| matches!(outcome, Err(Failure::Late))).count()
-        }
-    }
-
-    /// A worker that was slow for a while refuses a few acts for it, and then tries again: what it does not compute it cannot measure.
-    #[test]
-    fn a_slow_time_does_not_refuse_for_ever() {
-        let (mut slow, mut late) = (Slow::new(), 0);
-        while slow.batch.len() == 0 {
-            slow.offer(None);
-            late += slow.late();
-            assert!(late < 1000, "it never tries again");
-        }
-    }
-
-    /// While somebody is computed, a crowd that is too late tells nothing: each of them made the worker believe that it is faster, so it let in
-    /// the next ones, too late as well (goodput at twice the capacity fell from .73 to .08).
-    #[test]
-    fn a_late_crowd_does_not_make_it_fast() {
-        let mut slow = Slow::new();
-        slow.offer(Some(Duration::from_secs(3600)));
-        assert_eq!(slow.batch.len(), 1);
-        let before = slow.batch.slowness.get();
-        (0..50).for_each(|_| slow.offer(Some(Duration::ZERO)));
-        assert_eq!((slow.late(), slow.batch.len()), (50, 1));
-        assert!(slow.batch.slowness.get() == before, "{before} became {}", slow.batch.slowness.get());
-    }
-}
+#[path = "tick_tests.rs"]
+mod tests;

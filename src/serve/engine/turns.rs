@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-/// A client that holds more than this share of a batch is a heavy one.
+/// A client that holds more than this share of a batch, counted in rows, is a heavy one.
 const HEAVY_SHARE: usize = 4;
 
 /// Who takes part in a tick.
@@ -20,9 +20,9 @@ pub(super) enum Part {
 /// The clients of a worker's batch.
 #[derive(Debug)]
 pub(super) struct Turns {
-    /// Acts of each client.
-    acts: Vec<(u64, usize)>,
-    /// Acts above which a client is heavy.
+    /// Rows of each client.
+    rows: Vec<(u64, usize)>,
+    /// Rows above which a client is heavy.
     heavy: usize,
     has_heavy: bool,
     /// Seconds that each light client has had more than each heavy one.
@@ -30,21 +30,21 @@ pub(super) struct Turns {
 }
 
 impl Turns {
-    /// For batches of up to so many acts.
+    /// For batches of up to so many rows.
     pub fn new(batch_len_max: usize) -> Self {
-        Self { acts: Vec::with_capacity(batch_len_max), heavy: batch_len_max / HEAVY_SHARE, has_heavy: false, lead: 0.0 }
+        Self { rows: Vec::with_capacity(batch_len_max), heavy: batch_len_max / HEAVY_SHARE, has_heavy: false, lead: 0.0 }
     }
 
-    /// Takes note of who holds what.
-    pub fn count(&mut self, clients: impl Iterator<Item = u64>) {
-        self.acts.clear();
-        for client in clients {
-            match self.acts.iter_mut().find(|(known, _)| *known == client) {
-                Some((_, acts)) => *acts += 1,
-                None => self.acts.push((client, 1)),
+    /// Takes note of who holds what: of each act the client and its rows.
+    pub fn count(&mut self, acts: impl Iterator<Item = (u64, usize)>) {
+        self.rows.clear();
+        for (client, rows) in acts {
+            match self.rows.iter_mut().find(|(known, _)| *known == client) {
+                Some((_, sum)) => *sum += rows,
+                None => self.rows.push((client, rows)),
             }
         }
-        self.has_heavy = self.acts.iter().any(|(_, acts)| *acts > self.heavy);
+        self.has_heavy = self.rows.iter().any(|(_, rows)| *rows > self.heavy);
     }
 
     /// Places beyond the batch that are kept for light clients while a heavy one fills it.
@@ -54,7 +54,7 @@ impl Turns {
 
     /// Whether a client holds more than its share.
     pub fn is_heavy(&self, client: u64) -> bool {
-        self.has_heavy && self.acts.iter().any(|(known, acts)| *known == client && *acts > self.heavy)
+        self.has_heavy && self.rows.iter().any(|(known, rows)| *known == client && *rows > self.heavy)
     }
 
     /// Who takes part in the next tick. The light ones may be ahead by `credit` at most.
@@ -74,8 +74,8 @@ impl Turns {
 
     /// Heavy ones, and light ones.
     fn clients(&self) -> (usize, usize) {
-        let heavy = self.acts.iter().filter(|(_, acts)| *acts > self.heavy).count();
-        (heavy, self.acts.len() - heavy)
+        let heavy = self.rows.iter().filter(|(_, rows)| *rows > self.heavy).count();
+        (heavy, self.rows.len() - heavy)
     }
 }
 
@@ -87,7 +87,7 @@ mod tests {
     fn alike_clients_share_every_tick() {
         let mut turns = Turns::new(8);
         for clients in [vec![], vec![1; 8], vec![1, 1, 2, 2, 3, 3], vec![1, 1, 1, 2, 2, 2]] {
-            turns.count(clients.iter().copied());
+            turns.count(clients.iter().map(|client| (*client, 1)));
             assert_eq!(turns.part(Duration::from_millis(5)), Part::All, "{clients:?}");
         }
     }
@@ -96,7 +96,7 @@ mod tests {
     #[test]
     fn the_heavy_one_lets_the_others_go_ahead() {
         let (mut turns, [short, long]) = (Turns::new(8), [1, 10].map(Duration::from_millis));
-        turns.count([7; 8].into_iter().chain([9]));
+        turns.count([(7, 1); 8].into_iter().chain([(9, 1)]));
         assert!(turns.is_heavy(7) && !turns.is_heavy(9) && turns.reserve() == 2);
         let (mut of_light, mut of_heavy) = (Duration::ZERO, Duration::ZERO);
         for tick in 0..1000 {
@@ -108,8 +108,17 @@ mod tests {
         }
         let share = of_light.as_secs_f64() / (of_light + of_heavy).as_secs_f64();
         assert!((share - 0.5).abs() < 0.02, "{share}");
-        turns.count([7; 8].into_iter());
+        turns.count([(7, 1); 8].into_iter());
         (0..9).for_each(|_| turns.took(Part::All, long));
         assert_eq!(turns.lead, 0.0, "nothing is saved up");
+    }
+
+    /// One act of many candidates takes as long as many acts.
+    #[test]
+    fn an_act_of_many_rows_is_heavy() {
+        let mut turns = Turns::new(8);
+        turns.count([(7, 3), (9, 1)].into_iter());
+        assert!(turns.is_heavy(7) && !turns.is_heavy(9) && turns.reserve() == 2);
+        assert_eq!(turns.part(Duration::from_millis(5)), Part::Light);
     }
 }

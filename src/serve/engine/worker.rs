@@ -1,6 +1,6 @@
 //! One inference thread: get ready for new models, take what arrived, tick, show a sign of life.
 
-use super::{Shared, Ticket, queue::Room, tick::Batch};
+use super::{Shared, Ticket, cost::Load, queue::Room, tick::Batch};
 use std::{
     io,
     panic::{AssertUnwindSafe, catch_unwind},
@@ -48,12 +48,12 @@ fn run<T: Ticket>(shared: &Shared<T>, index: usize, batch: &mut Batch<T>) {
             let reserve = (len_max + turns.reserve()).saturating_sub(rows.max(len_max));
             let room = Room { any: len_max.saturating_sub(rows), light: reserve };
             let Some(arrivals) = shared.queue.take(index, held, room, |client| turns.is_heavy(client)) else { return };
-            let full = held + arrivals.len();
+            let full = Load { acts: held + arrivals.len(), rows: rows + arrivals.iter().map(|job| job.act.rows()).sum::<usize>() };
             for job in arrivals {
                 batch.admit(*job, full, &shared.tariff);
             }
             // The place of one that came too late is the next one's.
-            if batch.len() == full {
+            if batch.len() == full.acts {
                 break;
             }
         }

@@ -5,12 +5,14 @@ use crate::{
     model::{
         agent::{Chunk, Executed, Observation, Spec, Start},
         config::{Missing, Trained},
+        method::{Told, TrueFuture},
         options::{LatentMode, SamplerOptions},
     },
     serve::{
         error::ServiceError,
+        options::OptionsPatch,
         registry::Model,
-        request::{ActRequest, ActResult, Acted, Caller, Face, ListRequest, OpenRequest, OptionsPatch, ResetRequest},
+        request::{ActRequest, ActResult, Acted, Caller, Face, ListRequest, OpenRequest, ResetRequest},
         session::{Answer, Detail, Summary, Timings},
     },
 };
@@ -29,10 +31,96 @@ pub fn reset_request(request: pb::ResetSessionRequest) -> ResetRequest {
 }
 
 fn options_patch(options: pb::SamplerOptions) -> Checked<OptionsPatch> {
-    let pb::SamplerOptions { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = options;
+    let pb::SamplerOptions {
+        streaming,
+        action_horizon,
+        sub_steps,
+        eta,
+        temperature,
+        kappa,
+        latent,
+        guidance_scale,
+        guidance_samples,
+        free_guidance_scale,
+        told_return,
+        told_goal,
+        candidates,
+        pick_temperature,
+        picard_window,
+        picard_tolerance,
+    } = options;
     let size = |value: Option<u32>| value.map(|value| value as usize);
-    let latent = latent.map(latent_mode).transpose()?;
-    Ok(OptionsPatch { streaming, action_horizon: size(action_horizon), sub_steps: size(sub_steps), eta, temperature, kappa, latent })
+    Ok(OptionsPatch {
+        streaming,
+        action_horizon: size(action_horizon),
+        sub_steps: size(sub_steps),
+        eta,
+        temperature,
+        kappa: kappa.map(Into::into),
+        latent: latent.map(latent_mode).transpose()?,
+        guidance_scale,
+        guidance_samples: size(guidance_samples),
+        free_guidance_scale,
+        told_return,
+        told_goal: told_goal.map(vector),
+        candidates: size(candidates),
+        pick_temperature,
+        picard_window: size(picard_window),
+        picard_tolerance,
+    })
+}
+
+impl From<OptionsPatch> for pb::SamplerOptions {
+    fn from(options: OptionsPatch) -> Self {
+        let OptionsPatch {
+            streaming,
+            action_horizon,
+            sub_steps,
+            eta,
+            temperature,
+            kappa,
+            latent,
+            guidance_scale,
+            guidance_samples,
+            free_guidance_scale,
+            told_return,
+            told_goal,
+            candidates,
+            pick_temperature,
+            picard_window,
+            picard_tolerance,
+        } = options;
+        let count = |value: Option<usize>| value.map(|value| u32::try_from(value).unwrap_or(u32::MAX));
+        Self {
+            streaming,
+            action_horizon: count(action_horizon),
+            sub_steps: count(sub_steps),
+            eta,
+            temperature,
+            kappa: kappa.map(Into::into),
+            latent: latent.map(|mode| latent_word(mode).into()),
+            guidance_scale,
+            guidance_samples: count(guidance_samples),
+            free_guidance_scale,
+            told_return,
+            told_goal: told_goal.map(|values| pb::Vector { values }),
+            candidates: count(candidates),
+            pick_temperature,
+            picard_window: count(picard_window),
+            picard_tolerance,
+        }
+    }
+}
+
+fn sampler_options(options: &SamplerOptions) -> pb::SamplerOptions {
+    OptionsPatch::of(options).into()
+}
+
+fn latent_word(mode: LatentMode) -> pb::LatentMode {
+    match mode {
+        LatentMode::Mean => pb::LatentMode::Mean,
+        LatentMode::Sample => pb::LatentMode::Sample,
+    }
 }
 
 fn latent_mode(mode: i32) -> Checked<LatentMode> {
@@ -49,28 +137,37 @@ fn latent_mode(mode: i32) -> Checked<LatentMode> {
 pub fn act_request(request: pb::ActRequest, timeout: Option<Duration>, client: u64) -> Result<ActRequest, ActResult> {
     let pb::ActRequest { session_id, step, observation, deadline_ms, want_planned_states, episode } = request;
     let deadline = deadline_ms.map(|ms| Duration::from_millis(ms.into()));
-    match observation {
-        Some(observation) => {
-            let observation = self::observation(observation);
+    let missing = || ServiceError::invalid("observation", "is missing");
+    match observation.ok_or_else(missing).and_then(self::observation) {
+        Ok(observation) => {
             let caller = Caller { face: Face::Grpc, client };
             Ok(ActRequest { session_id, step, episode, observation, deadline, timeout, want_planned_states, caller })
         }
-        None => {
-            let result = Err(ServiceError::invalid("observation", "is missing"));
-            Err(ActResult { session_id, step, result })
-        }
+        Err(error) => Err(ActResult { session_id, step, result: Err(error) }),
     }
 }
 
-fn observation(observation: pb::Observation) -> Observation {
-    let pb::Observation { state, executed, nothing_executed } = observation;
-    let vector = |pb::Vector { values }| values;
+fn observation(observation: pb::Observation) -> Checked<Observation> {
+    let pb::Observation { state, executed, nothing_executed, context } = observation;
     let executed = executed.into_iter().map(|pb::Executed { state, action, reward }| Executed {
         state: state.map(vector),
         action: action.map(vector),
         reward,
     });
-    Observation { state, executed: executed.collect(), nothing_executed }
+    let context = context.map(|context| rows("observation.context", &context)).transpose()?;
+    Ok(Observation { state, executed: executed.collect(), nothing_executed, context })
+}
+
+fn vector(pb::Vector { values }: pb::Vector) -> Vec<f32> {
+    values
+}
+
+/// The rows of a matrix that holds what it says.
+fn rows(field: &str, matrix: &pb::Matrix) -> Checked<Vec<Vec<f32>>> {
+    let pb::Matrix { values, rows, columns } = matrix;
+    let holds = u64::from(*rows) * u64::from(*columns) == values.len() as u64 && (*columns > 0 || *rows == 0);
+    let wrong = || ServiceError::invalid(field, format!("has {} values in {rows} rows of {columns}", values.len()));
+    if holds { Ok(values.chunks((*columns as usize).max(1)).map(<[f32]>::to_vec).collect()) } else { Err(wrong()) }
 }
 
 pub fn list_request(request: pb::ListSessionsRequest) -> Checked<ListRequest> {
@@ -86,7 +183,19 @@ pub fn list_request(request: pb::ListSessionsRequest) -> Checked<ListRequest> {
 pub fn act_response(acted: &Acted) -> pb::ActResponse {
     let Acted { answer, replayed, want_planned_states } = acted;
     let Answer { session, step, chunk, timings, model, model_digest } = &**answer;
-    let Chunk { actions, planned_states, latent_mean, latent_log_var, predicted_state, evaluations, start, degraded } = chunk;
+    let Chunk {
+        actions,
+        planned_states,
+        latent_mean,
+        latent_log_var,
+        predicted_state,
+        evaluations,
+        passes,
+        value,
+        value_spread,
+        start,
+        degraded,
+    } = chunk;
     let (start, renoised_rungs) = self::start(*start);
     pb::ActResponse {
         session_id: session.to_string(),
@@ -104,6 +213,9 @@ pub fn act_response(acted: &Acted) -> pb::ActResponse {
         model: model.to_string(),
         model_digest: model_digest.clone(),
         degraded: *degraded,
+        passes: *passes,
+        value: *value,
+        value_spread: *value_spread,
     }
 }
 
@@ -175,27 +287,25 @@ pub fn session(summary: Summary) -> pb::Session {
     }
 }
 
-fn sampler_options(options: &SamplerOptions) -> pb::SamplerOptions {
-    let SamplerOptions { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = options;
-    let latent = match latent {
-        LatentMode::Mean => pb::LatentMode::Mean,
-        LatentMode::Sample => pb::LatentMode::Sample,
-    };
-    pb::SamplerOptions {
-        streaming: Some(*streaming),
-        action_horizon: Some(*action_horizon as u32),
-        sub_steps: Some(*sub_steps as u32),
-        eta: Some(*eta),
-        temperature: Some(*temperature),
-        kappa: Some(*kappa),
-        latent: Some(latent.into()),
-    }
-}
-
 pub fn model(model: &Model) -> pb::Model {
     let Model { name, agent, is_default } = model;
-    let Spec { layout, plan_horizon, block_len, obs_horizon, latent_dim, level_max, action_low, action_high, sampler, trained, digest } =
-        agent.spec();
+    let Spec {
+        layout,
+        plan_horizon,
+        block_len,
+        obs_horizon,
+        latent_dim,
+        level_max,
+        action_low,
+        action_high,
+        sampler,
+        trained,
+        told,
+        returns,
+        guide,
+        context,
+        digest,
+    } = agent.spec();
     pb::Model {
         name: name.to_string(),
         digest: digest.clone(),
@@ -212,7 +322,28 @@ pub fn model(model: &Model) -> pb::Model {
         sampler: Some(sampler_options(sampler)),
         refined: trained.refined,
         trained: Some(self::trained(trained)),
+        told: told.iter().map(self::told).collect(),
+        returns: returns.map(|[mean, std]| pb::Returns { mean, std }),
+        guide: *guide,
+        context: context.map(true_context),
     }
+}
+
+fn told(told: &Told) -> pb::Told {
+    match told {
+        Told::Return => pb::Told { kind: pb::ToldKind::Return.into(), columns: Vec::new() },
+        Told::Goal { columns } => {
+            pb::Told { kind: pb::ToldKind::Goal.into(), columns: columns.iter().map(|column| *column as u32).collect() }
+        }
+    }
+}
+
+fn true_context((dim, future): (usize, TrueFuture)) -> pb::TrueContext {
+    let future = match future {
+        TrueFuture::Held => pb::TrueFuture::Held,
+        TrueFuture::Known => pb::TrueFuture::Known,
+    };
+    pb::TrueContext { dim: dim as u32, future: future.into() }
 }
 
 fn trained(trained: &Trained) -> pb::Trained {

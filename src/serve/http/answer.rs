@@ -1,13 +1,10 @@
 //! Bodies that clients get: the protos' answers under the same names.
 
-use super::{json::OptionsBody, problem::Problem};
+use super::{models::ModelAnswer, problem::Problem};
 use crate::{
-    model::{
-        agent::{Chunk, Spec, Start},
-        config::{Missing, Trained},
-    },
+    model::agent::{Chunk, Start},
     serve::{
-        registry::Model,
+        options::OptionsPatch,
         request::{ActResult, Acted},
         session::{Answer, Summary, Timings},
     },
@@ -33,7 +30,7 @@ pub struct ActAnswer {
     latent_log_var: Vec<f32>,
     /// State after the chunk's last action.
     predicted_state: Vec<f32>,
-    /// Denoiser evaluations that it took.
+    /// Windows that the denoiser evaluated.
     evaluations: u32,
     /// `cold`, `warm` or `renoised`.
     start: &'static str,
@@ -44,6 +41,14 @@ pub struct ActAnswer {
     model_digest: String,
     /// Whether the deadline cut the sampling short.
     degraded: bool,
+    /// Forwards of the denoiser that it took part in, one after the other.
+    passes: u32,
+    /// What the guide holds the plan to be worth, where it led it or chose it: the discounted mean of the rewards to come.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    value: Option<f32>,
+    /// Standard deviation of that over the candidates.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    value_spread: Option<f32>,
 }
 
 /// Where the time went.
@@ -59,7 +64,19 @@ impl From<&Acted> for ActAnswer {
     fn from(acted: &Acted) -> Self {
         let Acted { answer, replayed, want_planned_states } = acted;
         let Answer { session, step, chunk, timings, model, model_digest } = &**answer;
-        let Chunk { actions, planned_states, latent_mean, latent_log_var, predicted_state, evaluations, start, degraded } = chunk.clone();
+        let Chunk {
+            actions,
+            planned_states,
+            latent_mean,
+            latent_log_var,
+            predicted_state,
+            evaluations,
+            passes,
+            value,
+            value_spread,
+            start,
+            degraded,
+        } = chunk.clone();
         let (start, renoised_rungs) = match start {
             Start::Cold => ("cold", 0),
             Start::Warm => ("warm", 0),
@@ -81,6 +98,9 @@ impl From<&Acted> for ActAnswer {
             model: model.to_string(),
             model_digest: model_digest.clone(),
             degraded,
+            passes,
+            value,
+            value_spread,
         }
     }
 }
@@ -141,7 +161,7 @@ pub struct SessionAnswer {
     #[serde(skip_serializing_if = "Option::is_none")]
     seed: Option<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    options: Option<OptionsBody>,
+    options: Option<OptionsPatch>,
     #[serde(skip_serializing_if = "Option::is_none")]
     latent_mean: Option<Vec<f32>>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -160,7 +180,7 @@ impl From<Summary> for SessionAnswer {
         let ms = |time: Duration| time.as_millis() as u64;
         let (mut digest, mut seed, mut options, mut latents) = (None, None, None, None);
         if let Some(detail) = detail {
-            (digest, seed, options) = (Some(detail.model_digest), Some(detail.seed), Some((&detail.options).into()));
+            (digest, seed, options) = (Some(detail.model_digest), Some(detail.seed), Some(OptionsPatch::of(&detail.options)));
             latents = Some(detail.latent.unwrap_or_default());
         }
         let (latent_mean, latent_log_var) = latents.unzip();
@@ -180,76 +200,6 @@ impl From<Summary> for SessionAnswer {
             ttl_ms: ms(ttl),
             state_bytes: state_bytes as u64,
             busy,
-        }
-    }
-}
-
-/// A model: what a client must know of it.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct ModelAnswer {
-    name: String,
-    digest: String,
-    is_default: bool,
-    state_dim: usize,
-    action_dim: usize,
-    plan_horizon: usize,
-    block_len: usize,
-    obs_horizon: usize,
-    latent_dim: usize,
-    level_max: usize,
-    action_low: Vec<f32>,
-    action_high: Vec<f32>,
-    sampler: OptionsBody,
-    refined: bool,
-    trained: TrainedAnswer,
-}
-
-/// What a session may ask for and leave out, because training did so too.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct TrainedAnswer {
-    action_horizons: Vec<usize>,
-    sub_steps: Vec<usize>,
-    missing: MissingAnswer,
-    /// Whether histories crossed from one episode into the next, so that a reset may keep them.
-    sessions: bool,
-}
-
-/// Parts of an executed step that may be missing without being guessed.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct MissingAnswer {
-    state: bool,
-    action: bool,
-    reward: bool,
-}
-
-impl From<Trained> for TrainedAnswer {
-    fn from(trained: Trained) -> Self {
-        let Trained { action_horizons, sub_steps, missing: Missing { state, action, reward }, refined: _, sessions } = trained;
-        Self { action_horizons, sub_steps, missing: MissingAnswer { state, action, reward }, sessions }
-    }
-}
-
-impl From<&Model> for ModelAnswer {
-    fn from(model: &Model) -> Self {
-        let Model { name, agent, is_default } = model;
-        let Spec { layout, plan_horizon, block_len, obs_horizon, latent_dim, level_max, action_low, action_high, sampler, trained, digest } =
-            agent.spec().clone();
-        Self {
-            name: name.to_string(),
-            digest,
-            is_default: *is_default,
-            state_dim: layout.state_dim,
-            action_dim: layout.action_dim,
-            plan_horizon,
-            block_len,
-            obs_horizon,
-            latent_dim,
-            level_max,
-            action_low,
-            action_high,
-            sampler: (&sampler).into(),
-            refined: trained.refined,
-            trained: trained.into(),
         }
     }
 }

@@ -1,13 +1,13 @@
 //! Bodies that clients send: the protos' requests under the same names.
 
 use crate::{
-    model::{
-        agent::{Executed, Observation},
-        options::{LatentMode, SamplerOptions},
+    model::agent::{Executed, Observation},
+    serve::{
+        options::OptionsPatch,
+        request::{ActRequest, Caller, Face, OpenRequest, ResetRequest},
     },
-    serve::request::{ActRequest, Caller, Face, OpenRequest, OptionsPatch, ResetRequest},
 };
-use serde::{Deserialize, Deserializer, Serialize, de};
+use serde::Deserialize;
 use std::time::Duration;
 use utoipa::{IntoParams, ToSchema};
 
@@ -21,75 +21,12 @@ pub struct OpenBody {
     #[schema(format = "uint64")]
     seed: Option<u64>,
     /// Overrides of the model's sampling defaults.
-    options: Option<OptionsBody>,
+    options: Option<OptionsPatch>,
     /// Idle time to live.
     #[schema(format = "uint64")]
     ttl_ms: Option<u64>,
     /// The client's name for this request: while the session lives, the same again gives the same session.
     request_id: Option<String>,
-}
-
-/// How a chunk is sampled; absent: as the model has it.
-#[derive(Debug, Default, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct OptionsBody {
-    /// Keep the partly denoised window between acts.
-    streaming: Option<bool>,
-    /// Actions that one act returns.
-    action_horizon: Option<usize>,
-    /// Sub-steps per rung of the ladder.
-    sub_steps: Option<usize>,
-    /// 0 is DDIM, 1 is DDPM.
-    eta: Option<f32>,
-    /// Factor on the standard deviation of all noise.
-    temperature: Option<f32>,
-    /// Trust region of the zig-zag refinement in nats, or "infinity".
-    kappa: Option<Kappa>,
-    /// `mean` or `sample`.
-    #[schema(value_type = Option<String>)]
-    latent: Option<LatentMode>,
-}
-
-/// JSON has no infinity: here it is a word.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize, ToSchema)]
-#[serde(untagged, expecting = "expected a finite number or \"infinity\"")]
-enum Kappa {
-    Nats(#[serde(deserialize_with = "finite")] f32),
-    Unbounded(#[serde(deserialize_with = "infinity")] Unbounded),
-}
-
-/// `"infinity"`.
-#[derive(Clone, Copy, Debug, Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-enum Unbounded {
-    Infinity,
-}
-
-/// A number that is finite as f32 too.
-fn finite<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
-    let value = f32::deserialize(deserializer)?;
-    if value.is_finite() { Ok(value) } else { Err(de::Error::custom("is not a finite number")) }
-}
-
-/// The word alone: what is untagged is read from a copy that is not [`super::strict`] any more.
-fn infinity<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Unbounded, D::Error> {
-    let word = String::deserialize(deserializer)?;
-    if word == "infinity" { Ok(Unbounded::Infinity) } else { Err(de::Error::custom("is another word")) }
-}
-
-impl From<Kappa> for f32 {
-    fn from(kappa: Kappa) -> Self {
-        match kappa {
-            Kappa::Nats(nats) => nats,
-            Kappa::Unbounded(Unbounded::Infinity) => f32::INFINITY,
-        }
-    }
-}
-
-impl From<f32> for Kappa {
-    fn from(nats: f32) -> Self {
-        if nats == f32::INFINITY { Self::Unbounded(Unbounded::Infinity) } else { Self::Nats(nats) }
-    }
 }
 
 /// Act.
@@ -124,6 +61,8 @@ struct ObservationBody {
     executed: Option<Vec<ExecutedBody>>,
     /// Nothing of the last chunk was executed, and no time has passed; then `executed` must be absent or empty.
     nothing_executed: Option<bool>,
+    /// The true context of now and of the steps to come, a row each; for an oracle alone, see the model's `context`.
+    context: Option<Vec<Vec<f32>>>,
 }
 
 /// One executed step; what is missing is masked.
@@ -200,10 +139,8 @@ pub enum View {
 impl From<OpenBody> for OpenRequest {
     fn from(body: OpenBody) -> Self {
         let OpenBody { model, seed, options, ttl_ms, request_id } = body;
-        let OptionsBody { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = options.unwrap_or_default();
-        let kappa = kappa.map(f32::from);
-        let options = OptionsPatch { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent };
-        Self { model: model.unwrap_or_default(), seed, options, ttl_ms, request_id: request_id.unwrap_or_default() }
+        let (model, options) = (model.unwrap_or_default(), options.unwrap_or_default());
+        Self { model, seed, options, ttl_ms, request_id: request_id.unwrap_or_default() }
     }
 }
 
@@ -211,7 +148,7 @@ impl ActBody {
     /// The act of this session.
     pub fn into_request(self, session_id: String, client: u64) -> ActRequest {
         let Self { session_id: _, step, observation, deadline_ms, want_planned_states, episode } = self;
-        let ObservationBody { state, executed, nothing_executed } = observation;
+        let ObservationBody { state, executed, nothing_executed, context } = observation;
         let step_of = |ExecutedBody { state, action, reward }| Executed { state, action, reward };
         ActRequest {
             session_id,
@@ -221,26 +158,12 @@ impl ActBody {
                 state,
                 executed: executed.unwrap_or_default().into_iter().map(step_of).collect(),
                 nothing_executed: nothing_executed.unwrap_or(false),
+                context,
             },
             deadline: deadline_ms.map(|ms| Duration::from_millis(ms.into())),
             timeout: None,
             want_planned_states: want_planned_states.unwrap_or(false),
             caller: Caller { face: Face::Http, client },
-        }
-    }
-}
-
-impl From<&SamplerOptions> for OptionsBody {
-    fn from(options: &SamplerOptions) -> Self {
-        let SamplerOptions { streaming, action_horizon, sub_steps, eta, temperature, kappa, latent } = options;
-        Self {
-            streaming: Some(*streaming),
-            action_horizon: Some(*action_horizon),
-            sub_steps: Some(*sub_steps),
-            eta: Some(*eta),
-            temperature: Some(*temperature),
-            kappa: Some((*kappa).into()),
-            latent: Some(*latent),
         }
     }
 }

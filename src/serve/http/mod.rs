@@ -3,6 +3,7 @@
 mod answer;
 mod body;
 mod json;
+mod models;
 mod problem;
 mod routes;
 mod stream;

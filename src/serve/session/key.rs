@@ -8,9 +8,10 @@ pub type Key = [u8; 32];
 
 /// Key of an observation: every value by its bits, every absence by a mark, every list by its length.
 pub fn key_of(observation: &Observation) -> Key {
-    let Observation { state, executed, nothing_executed } = observation;
+    let Observation { state, executed, nothing_executed, context } = observation;
     let mut hash = Sha256::new();
-    hash.update([u8::from(*nothing_executed)]);
+    hash.update([u8::from(*nothing_executed), u8::from(context.is_some())]);
+    hash.update((executed.len() as u64).to_le_bytes());
     let mut put = |values: Option<&[f32]>| {
         hash.update(values.map_or(u64::MAX, |values| values.len() as u64).to_le_bytes());
         for value in values.into_iter().flatten() {
@@ -23,6 +24,7 @@ pub fn key_of(observation: &Observation) -> Key {
         put(action.as_deref());
         put(reward.as_ref().map(std::slice::from_ref));
     }
+    context.iter().flatten().for_each(|row| put(Some(row)));
     hash.finalize().into()
 }
 
@@ -39,7 +41,15 @@ mod tests {
             reward,
         };
         let told = |executed| Observation { state: vec![1.0], executed, ..Observation::default() };
+        let truth = |context: &[&[f32]]| {
+            let context = Some(context.iter().map(|row| row.to_vec()).collect());
+            Observation { state: vec![1.0], context, ..Observation::default() }
+        };
         let observations = [
+            truth(&[]),
+            truth(&[&[2.0]]),
+            truth(&[&[2.0], &[2.0]]),
+            truth(&[&[2.0, 2.0]]),
             Observation { state: vec![1.0, 2.0], ..Observation::default() },
             Observation { state: vec![1.0], ..Observation::default() },
             Observation { state: vec![1.0], nothing_executed: true, ..Observation::default() },

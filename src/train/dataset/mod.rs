@@ -1,6 +1,8 @@
 //! Offline trajectories: read, checked, split by episodes, brought to the units of the networks.
+pub mod beside;
 pub mod hdf5;
 pub mod hidden;
+pub mod returns;
 pub mod room;
 pub mod rows;
 pub mod surprises;
@@ -244,7 +246,7 @@ impl Dataset {
         let normalizer = Normalizer { state, action: units::affine_of(&columns), reward, state_change_std };
         let bounds = |of: fn(&ActionColumn) -> f32| columns.iter().map(of).collect();
         let (action_low, action_high) = (bounds(|column| column.low), bounds(|column| column.high));
-        Ok((Units { normalizer, action_low, action_high, latent_spread: 1.0 }, columns))
+        Ok((Units { normalizer, action_low, action_high, latent_spread: 1.0, returns: None, context: None }, columns))
     }
 }
 

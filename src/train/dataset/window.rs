@@ -2,6 +2,7 @@
 
 use super::{
     Episode,
+    beside::{Beside, BesideBatch},
     hidden::Hide,
     rows::{Step, surprise_width},
 };
@@ -260,6 +261,8 @@ pub struct WindowShape {
     pub ready_fraction: f32,
     /// What is hidden of the history.
     pub hide: Hide,
+    /// What windows are told beside it.
+    pub beside: Beside,
 }
 
 impl WindowShape {
@@ -348,6 +351,8 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
     }
     let dims = (shape.batch, shape.horizon, layout.dim());
     let noise: Vec<f32> = (0..window.len()).map(|_| rng.normal()).collect();
+    let places = drawn.iter().map(|drawn| (&drawn.episode, drawn.start.unsigned_abs(), drawn.imagined));
+    let BesideBatch { told, truth, returns } = shape.beside.of(places, shape.horizon, rng)?;
     let observed = match shape.obs_horizon {
         0 | 1 => None,
         real => Some(Tensor::from_vec(observed, (shape.batch, 1, (real - 1) * layout.dim()), &Device::Cpu)?),
@@ -362,6 +367,9 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
         at: drawn.iter().map(|drawn| drawn.standing.clone()).collect(),
         imagined: drawn.iter().map(|drawn| drawn.imagined).collect(),
         noise: Tensor::from_vec(noise, dims, &Device::Cpu)?,
+        told,
+        truth,
+        returns,
     })
 }
 

@@ -26,7 +26,7 @@ fn block_shape(batch: usize, looks: Looks) -> BlockShape {
 fn row_of(standing: &Standing) -> usize {
     match standing {
         Standing::Row(row) => *row,
-        Standing::Levels(_) => panic!("a row"),
+        Standing::Levels(_) | Standing::Clean => panic!("a row"),
     }
 }
 
@@ -76,11 +76,12 @@ fn windows_follow_their_history() {
         horizon: 4,
         looks: Looks::Block(3),
         obs_horizon: 3,
-        table: Table::new(Schedule::Ladder, 4, 2, 8).unwrap(),
+        table: Table::new(Schedule::LADDER, [0, 4], 2, 8).unwrap(),
         levels: Levels::Schedule,
         action_horizons: vec![3],
         ready_fraction: 0.5,
         hide: Hide::NOTHING,
+        beside: Beside::default(),
     };
     let batch = windows(&episodes, &shape.places(&episodes), &shape, None, &mut Philox::new(2)).unwrap();
     let (window, history) = (rows(&batch.window), rows(&batch.history.state));
@@ -130,11 +131,12 @@ fn hidden_fields_are_hidden_from_both_networks() {
         horizon: 4,
         looks: Looks::Block(3),
         obs_horizon: 3,
-        table: Table::new(Schedule::Ladder, 4, 1, 8).unwrap(),
+        table: Table::new(Schedule::LADDER, [0, 4], 1, 8).unwrap(),
         levels: Levels::Schedule,
         action_horizons: vec![1, 2],
         ready_fraction: 0.5,
         hide,
+        beside: Beside::default(),
     };
     let batch = windows(&episodes, &shape.places(&episodes), &shape, None, &mut Philox::new(2)).unwrap();
     let (present, state) = (rows(&batch.history.present), rows(&batch.history.state));
@@ -182,7 +184,7 @@ fn hidden_fields_are_hidden_from_both_networks() {
 /// Levels of its own for each position, all of 0 ..= K, whatever row a sampler walks; and a uniform schedule has no READY, so nothing is imagined.
 #[test]
 fn levels_may_be_drawn_one_by_one() {
-    let (episodes, uniform) = (episodes(), Table::new(Schedule::Uniform { steps: 5 }, 4, 1, 8).unwrap());
+    let (episodes, uniform) = (episodes(), Table::new(Schedule::Uniform { steps: 5 }, [0, 4], 1, 8).unwrap());
     let shape = |table, levels| WindowShape {
         batch: 300,
         horizon: 4,
@@ -193,6 +195,7 @@ fn levels_may_be_drawn_one_by_one() {
         action_horizons: vec![1, 2],
         ready_fraction: 0.5,
         hide: Hide::NOTHING,
+        beside: Beside::default(),
     };
     let draw = |shape: WindowShape| windows(&episodes, &shape.places(&episodes), &shape, None, &mut Philox::new(4)).unwrap();
     let mut seen = [0; 9];
@@ -254,7 +257,7 @@ fn blocks_cross_the_border() {
 /// So do windows, with all that a GRU that runs on has read, and with what the denoiser sees.
 #[test]
 fn windows_cross_the_border() {
-    let (episodes, table) = (vec![following()], Table::new(Schedule::Ladder, 4, 1, 8).unwrap());
+    let (episodes, table) = (vec![following()], Table::new(Schedule::LADDER, [0, 4], 1, 8).unwrap());
     let shape = WindowShape {
         batch: 400,
         horizon: 4,
@@ -265,6 +268,7 @@ fn windows_cross_the_border() {
         action_horizons: vec![1],
         ready_fraction: 0.5,
         hide: Hide::NOTHING,
+        beside: Beside::default(),
     };
     let batch = windows(&episodes, &shape.places(&episodes), &shape, None, &mut Philox::new(1)).unwrap();
     let (window, states, lens) = (rows(&batch.window), rows(&batch.history.state), batch.history_lens.unwrap());

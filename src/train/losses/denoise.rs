@@ -13,7 +13,9 @@ use crate::train::{
     Task,
     dataset::{
         HELD_OUT_SEED, Sides, Which,
+        beside::Beside,
         hidden::Hide,
+        returns::Returns,
         window::{Levels, Places, WindowShape, windows},
     },
     recipe::{
@@ -28,7 +30,7 @@ use std::ops::Range;
 const HELD_OUT_WINDOWS: usize = 256;
 
 /// Play is nothing to imitate.
-const IMITATED: Which = Which::Demonstrations;
+pub(super) const IMITATED: Which = Which::Demonstrations;
 
 /// Parts of a batch whose gradients are computed side by side. A fixed number: another one adds up in another order, and a run must end
 /// in the same bytes on every machine.
@@ -60,27 +62,8 @@ impl<'a> DenoiseLoss<'a> {
     }
 
     fn new(task: &'a Task, weight: f64, moves_latents: bool) -> Self {
-        let (loss, sampler, plan) = (&task.recipe.losses.denoise, &task.recipe.sampler, &task.config.method.plan);
-        let shape = WindowShape {
-            batch: loss.batch,
-            horizon: plan.horizon,
-            looks: task.looks(),
-            obs_horizon: plan.obs_horizon,
-            table: Table::new(plan.schedule, plan.horizon, sampler.sub_steps, plan.level_max).expect("the recipe was checked: is a bug"),
-            levels: match loss.levels {
-                TrainingLevels::Schedule => Levels::Schedule,
-                TrainingLevels::Independent => Levels::Independent { level_max: plan.level_max },
-            },
-            action_horizons: task.recipe.action_horizons(),
-            ready_fraction: loss.ready_fraction,
-            hide: task.recipe.hide,
-        };
-        let options = RefineOptions {
-            routing: loss.routing,
-            first_action_weight: loss.first_action_weight,
-            sub_steps: sampler.sub_steps,
-            moves_latents,
-        };
+        let shape = window_shape(task, task.recipe.losses.denoise.batch);
+        let options = refine_options(task, moves_latents);
         let episodes = task.split.episodes.only(IMITATED);
         Self { task, weight, places: shape.places(&episodes.train), shape, episodes, options }
     }
@@ -122,7 +105,8 @@ impl<'a> DenoiseLoss<'a> {
     /// # Errors
     /// If a tensor operation fails.
     pub fn held_out_errors(&self, networks: &Networks) -> Result<Vec<f64>> {
-        let shape = WindowShape { batch: HELD_OUT_WINDOWS, hide: Hide::NOTHING, ..self.shape.clone() };
+        let beside = Beside { told_hidden: 0.0, ..self.shape.beside.clone() };
+        let shape = WindowShape { batch: HELD_OUT_WINDOWS, hide: Hide::NOTHING, beside, ..self.shape.clone() };
         let (episodes, rows) = (&self.episodes.held_out, shape.table.emit());
         let places = shape.places(episodes);
         let error = |row: usize| -> Result<f64> {
@@ -130,6 +114,43 @@ impl<'a> DenoiseLoss<'a> {
             Ok(f64::from(networks.refine_loss(&self.task.config.method.plan, &batch, &self.options)?.loss.to_scalar::<f32>()?))
         };
         (0..rows).map(error).collect()
+    }
+}
+
+/// Windows as the sampler meets them, so many in a batch.
+pub(super) fn window_shape(task: &Task, batch: usize) -> WindowShape {
+    let (loss, sampler, method) = (&task.recipe.losses.denoise, &task.recipe.sampler, &task.config.method);
+    let (plan, units) = (&method.plan, &task.config.units);
+    WindowShape {
+        batch,
+        horizon: plan.horizon,
+        looks: task.looks(),
+        obs_horizon: plan.obs_horizon,
+        table: Table::of(plan, sampler.sub_steps).expect("the recipe was checked: is a bug"),
+        levels: match loss.levels {
+            TrainingLevels::Schedule => Levels::Schedule,
+            TrainingLevels::Independent => Levels::Independent { level_max: plan.level_max },
+        },
+        action_horizons: task.recipe.action_horizons(),
+        ready_fraction: loss.ready_fraction,
+        hide: task.recipe.hide,
+        beside: Beside {
+            told: method.told.clone(),
+            told_hidden: loss.told_hidden,
+            returns: Returns::of(method.discount, units),
+            truth: method.latent.truth().and_then(|(_, future)| units.context.clone().map(|units| (units, future))),
+        },
+    }
+}
+
+/// How latents come to these windows.
+pub(super) fn refine_options(task: &Task, moves_latents: bool) -> RefineOptions {
+    let loss = &task.recipe.losses.denoise;
+    RefineOptions {
+        routing: loss.routing,
+        first_action_weight: loss.first_action_weight,
+        sub_steps: task.recipe.sampler.sub_steps,
+        moves_latents,
     }
 }
 

@@ -4,6 +4,8 @@
 pub mod context_free;
 pub mod denoise;
 pub mod elbo;
+pub mod inverse;
+pub mod value;
 
 use super::{
     Task,
@@ -21,6 +23,8 @@ use candle_core::backprop::GradStore;
 use context_free::ContextFreeLoss;
 use denoise::DenoiseLoss;
 use elbo::ElboLoss;
+use inverse::InverseLoss;
+use value::ValueLoss;
 
 /// A piece of a step's work, free to run on any thread.
 type Job<'a> = Box<dyn FnOnce() -> Result<Part> + Send + 'a>;
@@ -47,6 +51,8 @@ pub struct Objective<'a> {
     denoise: Option<DenoiseLoss<'a>>,
     elbo: Option<ElboLoss<'a>>,
     context_free: Option<ContextFreeLoss<'a>>,
+    inverse: Option<InverseLoss<'a>>,
+    value: Option<ValueLoss<'a>>,
 }
 
 impl<'a> Objective<'a> {
@@ -58,6 +64,8 @@ impl<'a> Objective<'a> {
             denoise: DenoiseLoss::of_stage(task, stage),
             elbo: ElboLoss::of_stage(task, stage),
             context_free: ContextFreeLoss::of_stage(task, stage),
+            inverse: InverseLoss::of_stage(task, stage),
+            value: ValueLoss::of_stage(task, stage),
         }
     }
 
@@ -68,10 +76,13 @@ impl<'a> Objective<'a> {
     pub fn prepared(mut self, networks: &Networks) -> Result<Self> {
         let baseline = networks.latent.as_ref().and_then(|latent| latent.baseline.as_ref());
         let stays = !self.stage.trains.contains_key(&Group::Baseline);
-        let Some(baseline) = baseline.filter(|_| stays && (self.denoise.is_some() || self.elbo.is_some())) else { return Ok(self) };
+        let windows = self.denoise.is_some() || self.elbo.is_some() || self.inverse.is_some() || self.value.is_some();
+        let Some(baseline) = baseline.filter(|_| stays && windows) else { return Ok(self) };
         let episodes = surprising(&self.task.split.episodes, baseline, &self.task.room)?;
         self.denoise.iter_mut().for_each(|loss| loss.look_at(&episodes));
         self.elbo.iter_mut().for_each(|loss| loss.look_at(&episodes));
+        self.inverse.iter_mut().for_each(|loss| loss.look_at(&episodes));
+        self.value.iter_mut().for_each(|loss| loss.look_at(&episodes));
         Ok(self)
     }
 
@@ -87,7 +98,7 @@ impl<'a> Objective<'a> {
         let mut scalars = means(&parts);
         let grads: Vec<GradStore> = parts.into_iter().map(|part| part.grads).collect();
         let rate = self.stage.learning_rate.at(step, self.stage.steps);
-        let rates: Vec<f64> = self.stage.trains.values().map(|factor| rate * factor).collect();
+        let rates: Vec<f64> = self.stage.factors(step).map(|factor| rate * factor).collect();
         let norm = learner.adam.step(&grads, &rates)?;
         if let Some(ema) = learner.ema.as_mut().filter(|_| norm.is_finite()) {
             ema.update(&learner.vars, step)?;
@@ -108,6 +119,12 @@ impl<'a> Objective<'a> {
         if let Some(context_free) = &self.context_free {
             jobs.push(context_free.job(networks, rng)?);
         }
+        if let Some(inverse) = &self.inverse {
+            jobs.push(inverse.job(networks, rng)?);
+        }
+        if let Some(value) = &self.value {
+            jobs.push(value.job(networks, rng)?);
+        }
         Ok(jobs)
     }
 
@@ -127,6 +144,12 @@ impl<'a> Objective<'a> {
         if let Some(context_free) = &self.context_free {
             scalars.push(("held_out_context_free", context_free.held_out(networks)?));
         }
+        if let Some(inverse) = &self.inverse {
+            scalars.push(("held_out_inverse", inverse.held_out(networks)?));
+        }
+        if let Some(value) = &self.value {
+            scalars.push(("held_out_value", value.held_out(networks)?));
+        }
         Ok(scalars)
     }
 
@@ -144,6 +167,8 @@ impl<'a> Objective<'a> {
             Loss::Denoise => "held_out_loss",
             Loss::Elbo => "held_out_elbo",
             Loss::ContextFree => "held_out_context_free",
+            Loss::Inverse => "held_out_inverse",
+            Loss::Value => "held_out_value",
         };
         let weighted = |(loss, weight): (&Loss, &f64)| {
             let found = held_out.iter().find(|(name, _)| *name == of(loss))?;

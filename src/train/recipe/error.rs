@@ -32,6 +32,16 @@ pub enum RecipeError {
         /// What is wrong and what is allowed.
         reason: String,
     },
+    /// A method that changes a key which cannot be.
+    #[error("method {path}: `{key}`: leads nowhere in this recipe{hint}")]
+    Method {
+        /// The file.
+        path: PathBuf,
+        /// Dotted name of the key.
+        key: String,
+        /// What there is instead, if that is known.
+        hint: String,
+    },
     /// An override that is not `key=value`, or of a key that cannot be.
     #[error("--set {text}: expected KEY=VALUE, for example stages.denoise.steps=100{hint}")]
     Override {

@@ -34,7 +34,7 @@ fn named(value: &Value) -> Option<Vec<(&str, &Table)>> {
     tables.map(|value| value.as_table().and_then(|table| Some((table.get("name")?.as_str()?, table)))).collect()
 }
 
-/// Sets `a.b.c=value` in a table; the value is read as TOML, else taken as a string.
+/// Sets `a.b.c=value` in a table; the value is read as TOML, else taken as a string. Nothing behind the sign takes the key out.
 ///
 /// # Errors
 /// If there is no `=`, no such table in a list, or the way leads through a value that is no table.
@@ -43,25 +43,60 @@ pub fn set(table: &mut Table, text: &str) -> Result<(), RecipeError> {
     let (key, value) = text.split_once('=').ok_or_else(|| malformed(String::new()))?;
     let parsed = toml::from_str::<Table>(&format!("value = {value}")).ok().and_then(|mut table| table.remove("value"));
     let value = parsed.unwrap_or_else(|| Value::String(value.into()));
-    let mut names: Vec<&str> = key.trim().split('.').collect();
-    let last = names.pop().filter(|name| !name.is_empty()).ok_or_else(|| malformed(String::new()))?;
-    let mut names = names.into_iter();
+    match &value {
+        Value::String(nothing) if nothing.is_empty() && !text.contains('"') => remove(table, key.trim()).map_err(malformed),
+        _ => put(table, key.trim(), value).map_err(malformed),
+    }
+}
+
+/// Puts a value at `a.b.c`, in the place of one that is there.
+///
+/// # Errors
+/// What there is instead of such a place.
+pub fn put(table: &mut Table, key: &str, value: Value) -> Result<(), String> {
+    let (way, last) = key.rsplit_once('.').unwrap_or(("", key));
+    if last.is_empty() {
+        return Err(String::new());
+    }
+    table_at(table, way, true)?.map(|inner| inner.insert(last.into(), value));
+    Ok(())
+}
+
+/// Takes `a.b.c` out, if it is there; of a list of named tables the one with that name.
+///
+/// # Errors
+/// As of [`put`].
+pub fn remove(table: &mut Table, key: &str) -> Result<(), String> {
+    let (way, last) = key.rsplit_once('.').unwrap_or(("", key));
+    if let Some(tables) = table.get_mut(way).and_then(Value::as_array_mut) {
+        tables.retain(|table| table.get("name").and_then(Value::as_str) != Some(last));
+        return Ok(());
+    }
+    table_at(table, way, false)?.map(|inner| inner.remove(last));
+    Ok(())
+}
+
+/// The table at the end of a way, made where there is none if `make` says so. In a list of named tables the way goes on by a name.
+fn table_at<'a>(table: &'a mut Table, way: &str, make: bool) -> Result<Option<&'a mut Table>, String> {
+    let mut names = way.split('.').filter(|name| !name.is_empty());
     let mut inner = table;
     while let Some(name) = names.next() {
+        if !inner.contains_key(name) && !make {
+            return Ok(None);
+        }
         let entry = inner.entry(name).or_insert_with(|| Value::Table(Table::new()));
         let of_list = if entry.is_array() { names.next() } else { None };
         inner = match of_list {
-            None => entry.as_table_mut().ok_or_else(|| malformed(format!("; `{name}` has no keys")))?,
+            None => entry.as_table_mut().ok_or_else(|| format!("; `{name}` has no keys"))?,
             Some(wanted) => {
                 let known = named(entry).unwrap_or_default().iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ");
                 let tables = entry.as_array_mut().into_iter().flatten().filter_map(Value::as_table_mut);
                 let mut called = tables.filter(|table| table.get("name").and_then(Value::as_str) == Some(wanted));
-                called.next().ok_or_else(|| malformed(format!("; `{name}` has no `{wanted}`, but: {known}")))?
+                called.next().ok_or_else(|| format!("; `{name}` has no `{wanted}`, but: {known}"))?
             }
         };
     }
-    inner.insert(last.into(), value);
-    Ok(())
+    Ok(Some(inner))
 }
 
 #[cfg(test)]

@@ -4,11 +4,7 @@ use super::{
     Recipe,
     error::{RecipeError, WEIGHTS, between, require},
 };
-use crate::model::{
-    diffusion::refine::LatentRouting,
-    latent::elbo::Ahead,
-    method::{Future, Schedule},
-};
+use crate::model::{diffusion::refine::LatentRouting, latent::elbo::Ahead, method::Future};
 use crate::train::dataset::Which;
 use serde::{Deserialize, Serialize};
 
@@ -27,6 +23,10 @@ pub enum Loss {
     Elbo,
     /// [`ContextFreeConfig`].
     ContextFree,
+    /// [`InverseConfig`].
+    Inverse,
+    /// [`ValueConfig`].
+    Value,
 }
 
 impl Loss {
@@ -36,6 +36,8 @@ impl Loss {
             Self::Denoise => "denoise",
             Self::Elbo => "elbo",
             Self::ContextFree => "context_free",
+            Self::Inverse => "inverse",
+            Self::Value => "value",
         }
     }
 }
@@ -50,6 +52,28 @@ pub struct Losses {
     pub elbo: Option<ElboConfig>,
     /// Denoise and refine.
     pub denoise: DenoiseConfig,
+    /// Inverse dynamics; absent for models whose plans have actions.
+    pub inverse: Option<InverseConfig>,
+    /// What windows are worth; absent for models without a value network.
+    pub value: Option<ValueConfig>,
+}
+
+/// Squared errors of the actions of real steps ([`crate::model::method::Head::Inverse`]).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InverseConfig {
+    /// Windows in a batch; all of their steps count.
+    pub batch: usize,
+}
+
+/// Squared errors of the return of noisy windows and clean ones ([`crate::model::method::Guide::Value`]).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ValueConfig {
+    /// Windows in a batch.
+    pub batch: usize,
+    /// Share of clean windows, by which plans are chosen; the others stand where the denoiser sees them.
+    pub clean_fraction: f32,
 }
 
 /// Squared errors of the models that know no context ([`crate::model::method::Baseline`]).
@@ -164,6 +188,18 @@ pub struct DenoiseConfig {
     pub action_horizons: Vec<usize>,
     /// Share of windows at READY rows, where latents are refined; the others are uniform over all rows.
     pub ready_fraction: f32,
+    /// Share of windows that are told nothing of what is wanted, of models that can be told (Ho and Salimans 2022).
+    #[serde(default = "usual_told_hidden", skip_serializing_if = "is_usual_told_hidden")]
+    pub told_hidden: f32,
+}
+
+/// Of Decision Diffuser.
+fn usual_told_hidden() -> f32 {
+    0.25
+}
+
+fn is_usual_told_hidden(share: &f32) -> bool {
+    *share == usual_told_hidden()
 }
 
 /// Levels of a training window.
@@ -191,7 +227,31 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
     require(tells || !weighs, "losses.elbo.context_weight", "needs model.latent.tells, the columns of the context")?;
     require(recipe.losses.elbo.is_none() || used(Loss::Elbo), "losses.elbo", "is minimized by no stage")?;
     check_baseline(recipe)?;
+    check_heads(recipe)?;
     check_denoise(recipe)
+}
+
+/// Networks beside the planner have losses, and losses networks.
+fn check_heads(recipe: &Recipe) -> Result<(), RecipeError> {
+    let model = &recipe.model;
+    let used = |loss: Loss| recipe.stages.iter().any(|stage| stage.weight(loss) > 0.0);
+    for (loss, there, asked, network) in [
+        (Loss::Inverse, recipe.losses.inverse.is_some(), model.head.is_inverse(), "model.head of kind inverse"),
+        (Loss::Value, recipe.losses.value.is_some(), model.has_value(), "model.guide of kind value"),
+    ] {
+        let key = format!("losses.{}", loss.name());
+        require(there || !asked, &key, format!("is missing, but {network} asks for it"))?;
+        require(asked || !there, &key, format!("needs {network}"))?;
+        require(!there || used(loss), &key, "is minimized by no stage")?;
+    }
+    if let Some(inverse) = &recipe.losses.inverse {
+        between("losses.inverse.batch", inverse.batch, 1..=BATCH_MAX)?;
+    }
+    if let Some(value) = &recipe.losses.value {
+        between("losses.value.batch", value.batch, 1..=BATCH_MAX)?;
+        between("losses.value.clean_fraction", value.clean_fraction, 0.0..=1.0)?;
+    }
+    between("losses.denoise.told_hidden", recipe.losses.denoise.told_hidden, 0.0..=1.0)
 }
 
 /// A baseline is what the surprises of all later stages are measured by, so it comes first.
@@ -225,7 +285,7 @@ fn check_denoise(recipe: &Recipe) -> Result<(), RecipeError> {
     let gaps = recipe.action_horizons().iter().all(|chunk| *chunk == 1) || recipe.hide.state > 0.0;
     require(gaps, "hide.state", "must be above 0 where a chunk has several actions: its client may know no states in between")?;
     let alone = recipe.action_horizons() == [1] || recipe.refines() || recipe.model.latent.gru().is_none();
-    let walks = recipe.model.plan.schedule == Schedule::Ladder;
+    let walks = recipe.model.plan.schedule.is_ladder();
     let reason = "must be 1 alone, as `sampler.action_horizon`: without refinement the latent of a chunk's later actions would be that of its \
                   first, which no window of training has";
     require(alone || !walks, "losses.denoise.action_horizons", reason)?;

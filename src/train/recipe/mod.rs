@@ -1,5 +1,6 @@
 //! A recipe: everything a training run depends on beside the data; typed, checked once, stored in the checkpoint.
 
+pub mod changes;
 pub mod error;
 pub mod keys;
 pub mod losses;
@@ -10,7 +11,8 @@ use crate::model::{
     checkpoint::{NAME_LEN_MAX, is_name},
     config::{Defaults, ModelConfig, Restart, Trained, Units},
     diffusion::refine::LatentRouting,
-    method::{Method, Schedule},
+    method::{LatentSource, Method, Schedule, Told},
+    normalizer::Affine,
     options::SamplerOptions,
     trajectory::Layout,
 };
@@ -23,6 +25,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
+pub use changes::Changes;
 pub use error::RecipeError;
 
 /// A training run.
@@ -62,26 +65,20 @@ pub struct Recipe {
 const SUB_STEPS_LISTED: usize = 64;
 
 impl Recipe {
-    /// Reads a recipe, applies overrides (`stages.denoise.steps=100`) and the path of another data set, and checks it.
+    /// Reads a recipe, changes it, and checks it.
     ///
     /// # Errors
-    /// If the file cannot be read, or a key is unknown, missing, or its value makes no sense.
-    pub fn read(path: &Path, overrides: &[String], data: Option<&Path>) -> Result<Self, RecipeError> {
+    /// If a file cannot be read, or a key is unknown, missing, or its value makes no sense.
+    pub fn read(path: &Path, changes: &Changes) -> Result<Self, RecipeError> {
         let text = std::fs::read_to_string(path).map_err(|error| RecipeError::Io { path: path.into(), reason: error.to_string() })?;
         let syntax = |error: toml::de::Error| RecipeError::Syntax { path: path.into(), reason: error.to_string() };
-        let mut recipe: Self = if overrides.is_empty() && data.is_none() {
-            toml::from_str(&text).map_err(syntax)?
-        } else {
-            let mut table: toml::Table = toml::from_str(&text).map_err(syntax)?;
-            overrides.iter().try_for_each(|text| keys::set(&mut table, text))?;
-            if data.is_some() {
-                // The path itself is set below: not every path can be a TOML string. The key need not be in the file.
-                table.insert("data".into(), toml::Value::String(String::new()));
-            }
-            table.try_into().map_err(syntax)?
-        };
-        if let Some(data) = data {
-            recipe.data = data.into();
+        let mut table: toml::Table = toml::from_str(&text).map_err(syntax)?;
+        let written = table.clone();
+        changes.make(&mut table)?;
+        // As it stands in the file, the message of a wrong key has its line.
+        let mut recipe: Self = if table == written { toml::from_str(&text) } else { table.try_into() }.map_err(syntax)?;
+        if let Some(data) = &changes.data {
+            recipe.data.clone_from(data);
         }
         recipe.check()?;
         Ok(recipe)
@@ -118,12 +115,24 @@ impl Recipe {
         all.into_iter().collect()
     }
 
-    /// What this recipe ships, with plain units in place of what only data and training tell.
+    /// What this recipe ships, with plain units, a context of one column and a return of 0 in place of what only data and training tell.
     pub fn config(&self, layout: Layout) -> ModelConfig {
+        let mut method = self.model.clone();
+        if let LatentSource::Truth { dim, .. } = &mut method.latent {
+            *dim = (*dim).max(1);
+        }
+        let mut sampler = self.sampler.clone();
+        if self.tells_high_return() {
+            sampler.told_return = Some(0.0);
+        }
         ModelConfig {
             layout,
-            method: self.model.clone(),
-            units: Units::plain(layout),
+            units: Units {
+                returns: method.asks_for_returns().then(|| Affine::identity(1)),
+                context: method.latent.truth().map(|(dim, _)| Affine::identity(dim)),
+                ..Units::plain(layout)
+            },
+            method,
             trained: Trained {
                 action_horizons: self.action_horizons(),
                 sub_steps: self.sub_steps(),
@@ -132,15 +141,21 @@ impl Recipe {
                 // What only the data tell.
                 sessions: false,
             },
-            defaults: Defaults { sampler: self.sampler.clone(), restart: self.restart },
+            defaults: Defaults { sampler, restart: self.restart },
         }
+    }
+
+    /// Whether the checkpoint's default is to be told a high return of the data: where nothing else can be told, and the recipe tells nothing.
+    pub fn tells_high_return(&self) -> bool {
+        self.model.told == [Told::Return] && self.sampler.told_return.is_none()
     }
 
     /// Sub-steps whose levels are trained, ascending.
     fn sub_steps(&self) -> Vec<usize> {
-        let most = self.model.plan.level_max / self.model.plan.horizon.max(1);
+        let plan = &self.model.plan;
+        let most = plan.level_max / (plan.horizon - plan.diffused.first_free().min(plan.horizon)).max(1);
         match (self.losses.denoise.levels, self.model.plan.schedule) {
-            (TrainingLevels::Independent, Schedule::Ladder) => (1..=most.min(SUB_STEPS_LISTED)).collect(),
+            (TrainingLevels::Independent, Schedule::Ladder { .. }) => (1..=most.min(SUB_STEPS_LISTED)).collect(),
             (TrainingLevels::Independent, Schedule::Uniform { .. }) | (TrainingLevels::Schedule, _) => vec![self.sampler.sub_steps],
         }
     }

@@ -19,11 +19,15 @@ pub enum Group {
     Latent,
     /// The planner.
     Denoiser,
+    /// Inverse dynamics.
+    Inverse,
+    /// What judges windows.
+    Guide,
 }
 
 impl Group {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Baseline, Self::Latent, Self::Denoiser];
+    pub const ALL: [Self; 5] = [Self::Baseline, Self::Latent, Self::Denoiser, Self::Inverse, Self::Guide];
 
     /// As recipes spell it.
     pub fn name(self) -> &'static str {
@@ -31,6 +35,8 @@ impl Group {
             Self::Baseline => "baseline",
             Self::Latent => "latent",
             Self::Denoiser => "denoiser",
+            Self::Inverse => "inverse",
+            Self::Guide => "guide",
         }
     }
 
@@ -40,6 +46,8 @@ impl Group {
             Self::Baseline => "latent.baseline.",
             Self::Latent => "latent.",
             Self::Denoiser => "denoiser.",
+            Self::Inverse => "inverse.",
+            Self::Guide => "guide.",
         }
     }
 
@@ -50,11 +58,13 @@ impl Group {
 
     /// Whether the gradient of a loss comes to it.
     fn is_reached_by(self, loss: Loss) -> bool {
-        match (self, loss) {
-            (Self::Baseline, Loss::ContextFree) | (Self::Latent, Loss::Elbo | Loss::Denoise) | (Self::Denoiser, Loss::Denoise) => true,
-            // How far off it is, is a fact for all that come after it.
-            (Self::Baseline, Loss::Elbo | Loss::Denoise) => false,
-            (Self::Latent | Self::Denoiser, Loss::ContextFree) | (Self::Denoiser, Loss::Elbo) => false,
+        match self {
+            Self::Baseline => loss == Loss::ContextFree,
+            // How far off the baseline is, and what the latent says, are facts for those that come after them.
+            Self::Latent => matches!(loss, Loss::Elbo | Loss::Denoise),
+            Self::Denoiser => loss == Loss::Denoise,
+            Self::Inverse => loss == Loss::Inverse,
+            Self::Guide => loss == Loss::Value,
         }
     }
 }
@@ -71,6 +81,9 @@ pub struct Stage {
     pub minimizes: BTreeMap<Loss, f64>,
     /// The networks that move, each with a factor on the learning rate.
     pub trains: BTreeMap<Group, f64>,
+    /// Networks that stand still after a share of the steps (the "freeze" ablation of the paper).
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub freezes: BTreeMap<Group, f64>,
     /// As a function of the step of this stage.
     pub learning_rate: LearningRate,
     /// Decoupled weight decay.
@@ -118,6 +131,12 @@ impl Stage {
         self.minimizes.get(&loss).copied().unwrap_or(0.0)
     }
 
+    /// Factors on the learning rate at a step, in the order of `trains`.
+    pub fn factors(&self, step: usize) -> impl Iterator<Item = f64> {
+        let moves = move |group: &Group| self.freezes.get(group).is_none_or(|share| (step as f64) < share * self.steps as f64);
+        self.trains.iter().map(move |(group, factor)| if moves(group) { *factor } else { 0.0 })
+    }
+
     /// Whether the latent alone is looked for; then a probe tells what was found.
     pub fn identifies(&self) -> bool {
         self.weight(Loss::Elbo) > 0.0 && self.weight(Loss::Denoise) == 0.0
@@ -131,6 +150,8 @@ impl Stage {
                 Loss::Denoise => true,
                 Loss::Elbo => recipe.losses.elbo.is_some(),
                 Loss::ContextFree => recipe.losses.context_free.is_some(),
+                Loss::Inverse => recipe.losses.inverse.is_some(),
+                Loss::Value => recipe.losses.value.is_some(),
             };
             require(*weight == 0.0 || there, key(&format!("minimizes.{}", loss.name())), format!("needs [losses.{}]", loss.name()))?;
         }
@@ -141,9 +162,16 @@ impl Stage {
                 Group::Denoiser => {}
                 Group::Latent => require(recipe.model.latent.gru().is_some(), &key, "needs model.latent")?,
                 Group::Baseline => require(recipe.model.latent.baseline().is_some(), &key, "needs model.latent.baseline")?,
+                Group::Inverse => require(recipe.losses.inverse.is_some(), &key, "needs model.head of kind inverse")?,
+                Group::Guide => require(recipe.losses.value.is_some(), &key, "needs model.guide of kind value")?,
             }
             let reached = self.minimizes.iter().any(|(loss, weight)| *weight > 0.0 && group.is_reached_by(*loss));
             require(reached, &key, "is not reached by any loss that this stage minimizes")?;
+        }
+        for (group, share) in &self.freezes {
+            let key = key(&format!("freezes.{}", group.name()));
+            between(&key, *share, 0.0..=1.0)?;
+            require(self.trains.contains_key(group), &key, "is not trained by this stage")?;
         }
         require(!self.trains.is_empty(), key("trains"), "names no network, so nothing would be learned")?;
         between(key("weight_decay"), self.weight_decay, WEIGHTS)?;
@@ -203,6 +231,13 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
     let learns = |group: Group| recipe.stages.iter().any(|stage| stage.trains.get(&group).is_some_and(|factor| *factor > 0.0));
     require(learns(Group::Denoiser), "stages", "train no denoiser, and a checkpoint of random weights would be shipped")?;
     require(recipe.model.latent.gru().is_none() || learns(Group::Latent), "stages", "train no latent, but model.latent asks for it")?;
+    for (group, asked) in [(Group::Inverse, recipe.model.head.is_inverse()), (Group::Guide, recipe.model.has_value())] {
+        require(
+            !asked || learns(group),
+            "stages",
+            format!("train no {}, and a checkpoint of random weights would be shipped", group.name()),
+        )?;
+    }
     require(
         last.keeps == Keeps::Last,
         key("keeps"),

@@ -17,7 +17,7 @@ fn observation(seed: usize, step: u64) -> pb::Observation {
     };
     let executed = if step > 1 && !seed.is_multiple_of(5) { vec![executed] } else { vec![] };
     let nothing_executed = executed.is_empty() && seed.is_multiple_of(10);
-    pb::Observation { state: vector(0, 4).values, executed, nothing_executed }
+    pb::Observation { state: vector(0, 4).values, executed, nothing_executed, context: None }
 }
 
 fn request(id: &str, seed: usize, step: u64) -> pb::ActRequest {
@@ -26,7 +26,7 @@ fn request(id: &str, seed: usize, step: u64) -> pb::ActRequest {
 }
 
 fn request_json(id: &str, seed: usize, step: u64) -> Value {
-    let pb::Observation { state, executed, nothing_executed } = observation(seed, step);
+    let pb::Observation { state, executed, nothing_executed, context: _ } = observation(seed, step);
     let executed: Vec<_> = executed
         .into_iter()
         .map(|pb::Executed { state, action, reward }| json!({"state": state.map(|v| v.values), "action": action.map(|v| v.values), "reward": reward}))
@@ -45,7 +45,7 @@ fn bits(answer: &pb::ActResponse) -> Vec<u32> {
         &answer.predicted_state,
     ];
     let floats = floats.into_iter().flatten().map(|value| value.to_bits());
-    floats.chain([answer.evaluations, answer.start as u32, answer.renoised_rungs]).collect()
+    floats.chain([answer.evaluations, answer.passes, answer.start as u32, answer.renoised_rungs]).collect()
 }
 
 fn bits_json(answer: &Value) -> Vec<u32> {
@@ -60,8 +60,8 @@ fn bits_json(answer: &Value) -> Vec<u32> {
         collect(&answer[field], &mut bits);
     }
     let start = ["", "cold", "warm", "renoised"].iter().position(|word| answer["start"] == *word).unwrap();
-    let rungs = answer["renoised_rungs"].as_u64().unwrap();
-    bits.extend([answer["evaluations"].as_u64().unwrap() as u32, start as u32, rungs as u32]);
+    let count = |field: &str| answer[field].as_u64().unwrap() as u32;
+    bits.extend([count("evaluations"), count("passes"), start as u32, count("renoised_rungs")]);
     bits
 }
 
@@ -69,7 +69,9 @@ fn bits_json(answer: &Value) -> Vec<u32> {
 async fn open_all(server: &Running) -> Vec<String> {
     let mut ids = Vec::new();
     for seed in 0..SEEDS {
-        let options = json!({"streaming": seed % 4 > 0, "action_horizon": 1 + seed % 2, "eta": 0.7, "temperature": 1, "latent": "sample", "sub_steps": 1 + seed % 3});
+        let mut options =
+            json!({"streaming": seed % 4 > 0, "action_horizon": 1 + seed % 2, "eta": 0.7, "temperature": 1, "latent": "sample"});
+        (options["sub_steps"], options["picard_window"]) = (json!(1 + seed % 3), json!(1 + seed / 3 % 3));
         ids.push(server.open(json!({"seed": seed, "options": options})).await);
     }
     ids

@@ -1,18 +1,18 @@
 //! The engine by itself: a poisoned batch, and the end.
 
-use super::models_dir;
+use super::{methods::fresh, models_dir};
 use ada_diffuser::{
     model::{
-        Networks,
         agent::{Agent, Observation},
-        checkpoint::{self, Provenance},
-        nn::params::Params,
+        checkpoint,
+        config::ModelConfig,
+        method::{Diffused, Head, Inverse},
         normalizer::Affine,
+        options::SamplerOptions,
     },
     serve::engine::{Engine, EngineOptions, Failure, Finished, Job, Patience, Question, Refusal, Ticket},
 };
 use std::{
-    path::Path,
     sync::{Arc, mpsc},
     time::{Duration, Instant},
 };
@@ -53,22 +53,31 @@ fn agent(name: &str) -> Arc<Agent> {
     Arc::new(checkpoint::load(&models_dir().join(name)).unwrap())
 }
 
-/// A model of states with one value less than the others take.
-fn narrow(dir: &Path) -> Agent {
-    let mut config = checkpoint::load(&models_dir().join("tiny")).unwrap().config().clone();
+fn fresh_agent(adjust: impl FnOnce(&mut ModelConfig)) -> Arc<Agent> {
+    Arc::new(checkpoint::load(&fresh(adjust).path().join("fresh")).unwrap())
+}
+
+/// Of states with one value less than the others take.
+fn narrow(config: &mut ModelConfig) {
     config.layout.state_dim -= 1;
     config.units.normalizer.state = Affine::identity(config.layout.state_dim);
     config.units.normalizer.state_change_std.pop();
-    let params = Params::fresh(7);
-    Networks::new(config.layout, &config.method, &params).unwrap();
-    let tensors = params.vars().into_iter().map(|(name, var)| (name, var.as_tensor().clone())).collect();
-    checkpoint::save(dir, &config, &tensors, &Provenance::default()).unwrap();
-    checkpoint::load(dir).unwrap()
+}
+
+/// A plan of states, whose actions are found afterwards.
+fn inverse(config: &mut ModelConfig) {
+    config.method.plan.diffused = Diffused::State;
+    config.method.head = Head::Inverse { network: Inverse::Mlp { width: 8 }, latent: true };
+    config.trained.action_horizons.retain(|actions| *actions < 8);
 }
 
 /// An act of `asked` that is run on `run_on`.
 fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Receiver<Outcome>) {
-    let episode = Arc::new(asked.open(seed, &asked.spec().sampler).unwrap());
+    job_with(asked, run_on, seed, &asked.spec().sampler)
+}
+
+fn job_with(asked: &Agent, run_on: &Arc<Agent>, seed: u64, options: &SamplerOptions) -> (Job<Seat>, mpsc::Receiver<Outcome>) {
+    let episode = Arc::new(asked.open(seed, options).unwrap());
     let observation = Observation { state: vec![0.1; asked.spec().layout.state_dim], ..Observation::default() };
     let question = Question { episode, observation };
     let act = question.begin(asked).unwrap();
@@ -93,8 +102,7 @@ fn one_worker(batch_len_max: usize) -> Engine<Seat> {
 /// An act of another model makes the shared forward fail; its batch mates are answered as if it had not been there.
 #[test]
 fn a_poisoned_act_fails_alone() {
-    let dir = tempfile::tempdir().unwrap();
-    let (tiny, narrow) = (agent("tiny"), narrow(dir.path()));
+    let (tiny, narrow) = (agent("tiny"), fresh_agent(narrow));
     let engine = one_worker(64);
     let (open_gate, gate) = mpsc::channel();
     let mut gate = Some(gate);
@@ -186,6 +194,50 @@ fn a_deadline_makes_larger_jumps() {
     let (calm, outcome) = job(&tiny, &tiny, 3);
     let expected = tiny.act(&calm.question.episode, &calm.question.observation).unwrap().1;
     assert_eq!(act(calm, outcome, Instant::now() + Duration::from_secs(3600)).chunk, expected);
+}
+
+/// An act of more rows than a batch holds has a tick for itself, and those of fewer go on together; all are answered as if they were alone.
+#[test]
+fn acts_of_many_rows_are_served_among_others() {
+    let (tiny, engine) = (agent("tiny"), one_worker(2));
+    engine.warm_up(&tiny).unwrap();
+    let windows = [8, 1, 2, 1, 8, 1];
+    let acts = windows.into_iter().enumerate().map(|(seed, picard_window)| {
+        let options = SamplerOptions { picard_window, streaming: false, ..tiny.spec().sampler.clone() };
+        let (job, outcome) = job_with(&tiny, &tiny, seed as u64, &options);
+        let expected = tiny.act(&job.question.episode, &job.question.observation).unwrap().1;
+        assert!(engine.submit(job).is_ok());
+        (outcome, expected)
+    });
+    for (outcome, expected) in acts.collect::<Vec<_>>() {
+        assert_eq!(outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap().chunk, expected);
+    }
+}
+
+/// A plan that a deadline cut short still asks for the actions between its states: in a batch, and alone after a batch that failed.
+#[test]
+fn a_plan_that_is_cut_short_gets_its_actions() {
+    let (planner, poison) = (fresh_agent(inverse), fresh_agent(|config| (narrow(config), inverse(config)).0));
+    for is_poisoned in [false, true] {
+        let engine = one_worker(8);
+        engine.warm_up(&planner).unwrap();
+        let (first, outcome) = job(&planner, &planner, 1);
+        assert!(engine.submit(first).is_ok());
+        let before = outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap();
+        let (mut late, outcome) = job(&planner, &planner, 1);
+        late.question.episode = Arc::new(before.episode);
+        late.act = late.question.begin(&planner).unwrap();
+        late.ticket.patience.due = Some(Instant::now());
+        let (open_gate, gate) = mpsc::channel();
+        late.ticket.gate = Some(gate);
+        let (bad, poisoned) = job(&poison, &planner, 2);
+        assert!(engine.submit(late).is_ok());
+        assert!(!is_poisoned || engine.submit(bad).is_ok());
+        open_gate.send(()).unwrap();
+        let chunk = outcome.recv_timeout(Duration::from_secs(20)).unwrap().unwrap().chunk;
+        assert_eq!((chunk.degraded, chunk.evaluations, chunk.actions.len()), (true, 0, 1), "poisoned: {is_poisoned}");
+        assert!(!is_poisoned || poisoned.recv_timeout(Duration::from_secs(20)).unwrap().is_err());
+    }
 }
 
 /// A model that nobody warmed up is served all the same; only, its acts are never hurried.

@@ -262,20 +262,20 @@ async fn json_that_does_not_fit() {
 async fn requests_and_options_that_do_not_fit() {
     let server = start(|_| {}).await;
     let options = |options: pb::SamplerOptions| pb::OpenSessionRequest { options: Some(options), ..Default::default() };
-    let none = pb::SamplerOptions::default();
+    let none = pb::SamplerOptions::default;
     for (grpc, http, field) in [
-        (pb::SamplerOptions { action_horizon: Some(0), ..none }, json!({"action_horizon": 0}), "options.action_horizon"),
-        (pb::SamplerOptions { action_horizon: Some(9), ..none }, json!({"action_horizon": 9}), "options.action_horizon"),
-        (pb::SamplerOptions { sub_steps: Some(0), ..none }, json!({"sub_steps": 0}), "options.sub_steps"),
-        (pb::SamplerOptions { eta: Some(2.0), ..none }, json!({"eta": 2}), "options.eta"),
-        (pb::SamplerOptions { kappa: Some(-1.0), ..none }, json!({"kappa": -1}), "options.kappa"),
+        (pb::SamplerOptions { action_horizon: Some(0), ..none() }, json!({"action_horizon": 0}), "options.action_horizon"),
+        (pb::SamplerOptions { action_horizon: Some(9), ..none() }, json!({"action_horizon": 9}), "options.action_horizon"),
+        (pb::SamplerOptions { sub_steps: Some(0), ..none() }, json!({"sub_steps": 0}), "options.sub_steps"),
+        (pb::SamplerOptions { eta: Some(2.0), ..none() }, json!({"eta": 2}), "options.eta"),
+        (pb::SamplerOptions { kappa: Some(-1.0), ..none() }, json!({"kappa": -1}), "options.kappa"),
     ] {
         let grpc = server.agent().await.open_session(options(grpc)).await.unwrap_err();
         let http = server.post("/v1/sessions", &json!({"options": http})).await;
         both(&grpc, &http, (Code::InvalidArgument, 400, "OPTIONS_INVALID"));
         assert_eq!((trailer(&grpc, "ada-field").as_deref(), http.json()["field"].as_str()), (Some(field), Some(field)));
     }
-    let grpc = server.agent().await.open_session(options(pb::SamplerOptions { latent: Some(9), ..none })).await.unwrap_err();
+    let grpc = server.agent().await.open_session(options(pb::SamplerOptions { latent: Some(9), ..none() })).await.unwrap_err();
     assert_eq!(failure(&grpc), (Code::InvalidArgument, "OPTIONS_INVALID".into()));
     for ttl_ms in [0, u64::MAX] {
         let grpc =

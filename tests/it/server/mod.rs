@@ -11,6 +11,7 @@ mod hold;
 mod late;
 mod lifecycle;
 mod limits;
+mod methods;
 mod steps;
 mod streams;
 

@@ -16,6 +16,7 @@ from ada_diffuser.commands.progress import progress
 
 if TYPE_CHECKING:
     from ada_diffuser.collect import Job
+    from ada_diffuser.dataset import Episodes
     from ada_diffuser.experts import Expert, ExpertRecipe, PolicyBank
 
 _ABOUT = """\
@@ -39,6 +40,9 @@ infos/blind tells those episodes, the card has the returns of both kinds.
 actions then say nothing of the true context, so that what comes of them does: data to find what is hidden in, and nothing to
 imitate. infos/play tells those episodes; ada-trainer has no planner imitate them.
 
+--also FILE puts the episodes of another data set behind these, as play: a latent is then found in both, and the planner imitates these
+alone. Data of other phases, gains and tasks, pooled for the latent and then narrowed to the target, is what meta-learning means here.
+
 --session-episodes N makes sessions of N episodes that follow one another: the environment is reset with a seed where a session begins
 and without one where it goes on, so that what is hidden may outlast an episode, as the wind of cheetah-wind-e does. infos/session has the
 number of the session at each step. --blind and --play are then shares of the sessions, each of which is of one kind throughout. Where
@@ -55,6 +59,8 @@ examples:
   ada-collect --env hopper-gravity-e --blind 0.5 --action-noise 0.1,0.2 --out data/mixed.h5
   ada-collect --env cheetah-gale-s --play 0.75 --episodes 1200 --out data/gale.h5
   ada-collect --env cheetah-wind-e --session-episodes 10 --play 0.5 --episodes 600 --out data/sessions.h5
+  ada-collect --env cheetah-wind-s --option gain=2 --episodes 150 --out data/strong-wind.h5
+  ada-collect --env cheetah-wind-s --also data/strong-wind.h5 --episodes 300 --out data/pooled.h5
   ada-collect --env my_module:Mine-v0 --expert my_module:policy --out data/mine.h5
 """
 
@@ -82,13 +88,17 @@ def _run(args: argparse.Namespace, command: str) -> None:
     _check_arguments(args)
     job = _plan(args)
     from ada_diffuser.collect import collect, data_card
-    from ada_diffuser.dataset import save_card, save_episodes
+    from ada_diffuser.dataset import save_card, save_episodes, with_play
 
+    others = _others(args.also)
     expert = _expert(args, job, blind=False)
     blind = _expert(args, job, blind=True) if job.blind else None
     with progress(job.episodes, "episodes", "episode", quiet=args.quiet) as advance:
         episodes, failed = collect(job, expert, advance, blind=blind)
     card = data_card(job, expert, episodes, failed, blind)
+    if others:
+        episodes = with_play(episodes, list(others.values()))
+        card["also"] = {name: {"episodes": len(other.returns()), "steps": len(other.rewards)} for name, other in others.items()}
     card["file"] = {"name": args.out.name, "sha256": save_episodes(episodes, args.out), "bytes": args.out.stat().st_size}
     card["command"] = command
     save_card(card, args.out)
@@ -127,6 +137,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     expert.add_argument(
         "--expert-iterations", type=int, metavar="N", help="updates in a search (default: as the environment's class says, 300)"
+    )
+    parser.add_argument(
+        "--also", action="append", default=[], type=Path, metavar="X.h5", help="episodes of another data set, as play; repeatable"
     )
     parser.add_argument("--json", action="store_true", help="print the data card instead of a summary")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -168,6 +181,19 @@ def _plan(args: argparse.Namespace) -> Job:
     return Job(
         env_id, options, args.episodes, noise, args.seed, args.episode_steps, args.blind, args.play, session_episodes=args.session_episodes
     )
+
+
+def _others(paths: Sequence[Path]) -> dict[str, Episodes]:
+    """Data sets that go behind this one, by file name; read before anything is flown."""
+    from ada_diffuser.dataset import load_episodes
+
+    found = {}
+    for path in paths:
+        try:
+            found[path.name] = load_episodes(path)
+        except (OSError, KeyError) as error:
+            raise ValueError(f"--also {path}: is no data set of ada-collect: {error}") from None
+    return found
 
 
 def _noise(text: str) -> tuple[float, ...]:

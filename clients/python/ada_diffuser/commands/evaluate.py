@@ -23,7 +23,7 @@ from ada_diffuser.commands import (
 )
 from ada_diffuser.commands.outputs import check_output, save_json
 from ada_diffuser.commands.progress import progress
-from ada_diffuser.messages import SamplerOptions
+from ada_diffuser.options import SamplerOptions, several, word
 
 if TYPE_CHECKING:
     from ada_diffuser.rollout import Evaluation, Trial
@@ -83,7 +83,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--episodes", type=int, default=50, help="episodes of each combination (default 50)")
     parser.add_argument("--seed", type=int, help=f"seed of the first episode (default 1000; {choose.FIRST_SEED} with --choose)")
     parser.add_argument("--vector", type=int, default=64, metavar="N", help="episodes, or sessions, side by side, at most (default 64)")
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=V1,V2", help="values of a sampling option")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=V1,V2", help="values of a sampling option; a list is one in brackets"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="a list with the numbers and returns of each combination and recipe")
     parser.add_argument("--markdown", action="store_true", help="print the table alone, no line as each combination ends")
     sessions = parser.add_argument_group("sessions")
@@ -104,9 +106,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def combinations(words: Sequence[str]) -> Iterator[SamplerOptions]:
-    """`["kappa=0,1", "streaming=true"]`: every choice of one value each. ValueError for a wrong one, before any is run."""
+    """`["kappa=0,1", "told_goal=[0,1],[1,0]"]`: every choice of one value each. ValueError for a wrong one, before any is run."""
     settings = parse_settings(words)
-    choices = [[(name, value.strip()) for value in values.split(",")] for name, values in settings.items()]
+    choices = [[(name, value) for value in several(values)] for name, values in settings.items()]
     yield from [SamplerOptions.parse(dict(choice)) for choice in itertools.product(*choices)]
 
 
@@ -211,7 +213,7 @@ def _entries(results: Sequence[Evaluation], readings: Sequence[Reading]) -> list
 def _line(result: Evaluation, which: str) -> str:
     from ada_diffuser.rollout.report import outcome
 
-    settings = " ".join(f"{name}={value}" for name, value in result.trial.options.given().items())
+    settings = " ".join(f"{name}={word(value)}" for name, value in result.trial.options.given().items())
     return " ".join(part for part in (which, result.model.name, settings, outcome(result)) if part)
 
 

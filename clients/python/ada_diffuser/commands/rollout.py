@@ -21,7 +21,7 @@ from ada_diffuser.commands import (
 )
 from ada_diffuser.commands.outputs import check_output, save_json
 from ada_diffuser.commands.progress import progress
-from ada_diffuser.messages import SamplerOptions
+from ada_diffuser.options import SamplerOptions
 
 if TYPE_CHECKING:
     from ada_diffuser.rollout import Evaluation
@@ -49,7 +49,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--episodes", type=int, default=10, help="episodes to run (default 10)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--vector", type=int, default=1, metavar="N", help="step N environments in lockstep by ActBatch")
-    parser.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help="sampling option, e.g. kappa=inf")
+    parser.add_argument(
+        "--option", action="append", default=[], metavar="NAME=VALUE", help="sampling option, e.g. kappa=inf or told_goal=[0.5,0.1]"
+    )
     parser.add_argument("--film", type=Path, metavar="GIF", help="film of the last episode")
     parser.add_argument("--plot", type=Path, metavar="PNG", help="rewards, returns, true and read-out context")
     parser.add_argument("--json", type=Path, metavar="FILE", help="the numbers of the table and each episode's return")

@@ -20,8 +20,8 @@ _ABOUT = """\
 Cells = methods x environments x training seeds, as a file says. Each cell collects its data (once), trains, serves, rolls out cold and
 streaming, and probes; what it found goes to report/cells/SUITE/ENVIRONMENT/METHOD/seedN-MODE.json.
 
-  ada-suite run report/suites/table1-point-wind-s.toml      # stop it at any time; the same command goes on
-  ada-suite status report/suites/table1-point-wind-s.toml
+  ada-suite run report/suites/planners.toml      # stop it at any time; the same command goes on
+  ada-suite status report/suites/planners.toml
   ada-suite report                                          # report/README.md and its pictures, from the finished cells
 
 A finished cell is done again when its part of the suite, its recipe or its data change, and only then. Cells that fail are told at the end

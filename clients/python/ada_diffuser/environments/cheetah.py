@@ -72,7 +72,10 @@ class _CheetahWind(CheetahTask):
         raise NotImplementedError
 
     def _context(self) -> float:
-        return self.gain * (self.mean + self.swing * math.sin(self.rate * self._clock() + self._phi))
+        return self._force(self._clock())
+
+    def _force(self, clock: int) -> float:
+        return self.gain * (self.mean + self.swing * math.sin(self.rate * clock + self._phi))
 
     def _wind(self) -> float:
         return self._context()
@@ -95,6 +98,9 @@ class CheetahWindS(_CheetahWind, name="cheetah-wind-s", id="ada/CheetahWind-S-v0
 
     def _clock(self) -> int:
         return self._step
+
+    def _coming(self, steps: int) -> list[float]:
+        return [self._force(self._step + ahead) for ahead in range(steps)]
 
 
 class CheetahWindE(_CheetahWind, name="cheetah-wind-e", id="ada/CheetahWind-E-v0"):

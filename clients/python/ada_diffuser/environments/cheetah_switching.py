@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -42,14 +43,21 @@ class CheetahSwitching(CheetahTask):
 
     def _context(self) -> float:
         while len(self._drawn) <= self._step:
-            self._drawn.append(self._following(self._drawn[-1]))
+            self._drawn.append(self._following(self._drawn[-1], self.np_random))
         return self._drawn[self._step]
 
-    def _following(self, value: float) -> float:
+    def _coming(self, steps: int) -> list[float]:
+        """What the steps to come will draw, drawn by a copy of the generator."""
+        drawn, rng = list(self._drawn), deepcopy(self.np_random)
+        while len(drawn) < self._step + steps:
+            drawn.append(self._following(drawn[-1], rng))
+        return drawn[self._step : self._step + steps]
+
+    def _following(self, value: float, rng: np.random.Generator) -> float:
         others = [other for other in self.search_targets if other != value]
-        if not others or self.np_random.random() >= self.change:
+        if not others or rng.random() >= self.change:
             return value
-        return others[self.np_random.integers(len(others))]
+        return others[rng.integers(len(others))]
 
 
 class CheetahGaleS(CheetahSwitching, name="cheetah-gale-s", id="ada/CheetahGale-S-v0"):

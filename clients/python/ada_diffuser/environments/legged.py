@@ -47,6 +47,10 @@ class LeggedTask(HiddenTask, MujocoEnv):
         """The hidden number of the episode, shape (1,)."""
         return np.array([self._drawn], np.float32)
 
+    def coming_context(self, steps: int) -> np.ndarray:
+        """See `HiddenTask`."""
+        return np.tile(self.context, (steps, 1))
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; see `gymnasium.Env.reset`."""
         _, info = super().reset(seed=seed, options=options)

@@ -57,6 +57,10 @@ class PendulumGravityE(HiddenTask, PendulumEnv, name="pendulum-gravity-e", id="a
         """The gravity, shape (1,)."""
         return np.array([self.g], np.float32)
 
+    def coming_context(self, steps: int) -> np.ndarray:
+        """See `HiddenTask`."""
+        return np.tile(self.context, (steps, 1))
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; `options` are Pendulum-v1's."""
         observation, _ = super().reset(seed=seed, options=options)

@@ -55,7 +55,12 @@ class PendulumTorqueS(HiddenTask, PendulumEnv, name="pendulum-torque-s", id="ada
     @property
     def context(self) -> np.ndarray:
         """The torque of the coming step, shape (1,)."""
-        return np.array([self.swing * math.sin(self.rate * self._step + self._phi)], np.float32)
+        return self.coming_context(1)[0]
+
+    def coming_context(self, steps: int) -> np.ndarray:
+        """See `HiddenTask`."""
+        ahead = range(self._step, self._step + steps)
+        return np.array([[self.swing * math.sin(self.rate * step + self._phi)] for step in ahead], np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; `options` are Pendulum-v1's."""

@@ -68,8 +68,11 @@ class PointWindS(HiddenTask, name="point-wind-s", id="ada/PointWind-S-v0"):
     @property
     def context(self) -> np.ndarray:
         """The wind `w_t u` that acts on the coming step, shape (2,)."""
-        wind = WIND_MEAN + WIND_SWING * math.sin(self.omega * self._step + self._phi)
-        return (wind * self._direction).astype(np.float32)
+        return self._wind(self._step)
+
+    def coming_context(self, steps: int) -> np.ndarray:
+        """See `HiddenTask`."""
+        return np.stack([self._wind(self._step + ahead) for ahead in range(steps)])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; see `gymnasium.Env.reset`."""
@@ -127,6 +130,10 @@ class PointWindS(HiddenTask, name="point-wind-s", id="ada/PointWind-S-v0"):
         draw.line((x, y, x + wind_x, y - wind_y), fill=(200, 60, 40), width=2)
         draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=(30, 90, 180))
         return np.asarray(frame)
+
+    def _wind(self, step: int) -> np.ndarray:
+        wind = WIND_MEAN + WIND_SWING * math.sin(self.omega * step + self._phi)
+        return (wind * self._direction).astype(np.float32)
 
     def _observation(self) -> np.ndarray:
         return np.concatenate([self._position, self._velocity]).astype(np.float32)

@@ -62,6 +62,10 @@ class RunningTask(HiddenTask):
         """The hidden value that acts on the coming step, shape (1,)."""
         return np.array([self._context()], np.float32)
 
+    def coming_context(self, steps: int) -> np.ndarray:
+        """See `HiddenTask`."""
+        return np.array(self._coming(steps), np.float32)[:, None]
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; see the class for `seed` and `options`."""
         super().reset(seed=seed)
@@ -103,6 +107,10 @@ class RunningTask(HiddenTask):
 
     def _context(self) -> float:
         raise NotImplementedError
+
+    def _coming(self, steps: int) -> list[float]:
+        """`_context` of so many steps from now on; it stays as it is, unless a task says another."""
+        return [self._context()] * steps
 
     def _move(self, action: np.ndarray) -> float:
         """Make the step; returns the speed in m/s."""

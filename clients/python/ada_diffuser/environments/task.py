@@ -50,6 +50,13 @@ class HiddenTask(gym.Env[np.ndarray, np.ndarray]):
         """The hidden value that acts on the coming step, a vector."""
         raise NotImplementedError
 
+    def coming_context(self, steps: int) -> np.ndarray | None:
+        """The contexts of the coming steps, `(steps, dim)`, the first of them that of now; None: what comes cannot be told.
+
+        An oracle that knows the future is told them. To ask changes nothing: what is drawn later is drawn as if nobody had.
+        """
+        return None
+
     @property
     def mean_context(self) -> np.ndarray | None:
         """What a blind expert that is a formula takes the context for, in every episode; None: there is no blind expert."""

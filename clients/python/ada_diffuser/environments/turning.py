@@ -58,7 +58,13 @@ class DirectionTask(RunningTask):
         self._phi = drawn if self.phase is None else self.phase
 
     def _context(self) -> float:
-        share = 1.0 / (1.0 + math.exp(-SHARPNESS * math.sin(2.0 * math.pi * self._step / PERIOD + self._phi)))
+        return self._direction(self._step)
+
+    def _coming(self, steps: int) -> list[float]:
+        return [self._direction(self._step + ahead) for ahead in range(steps)]
+
+    def _direction(self, step: int) -> float:
+        share = 1.0 / (1.0 + math.exp(-SHARPNESS * math.sin(2.0 * math.pi * step / PERIOD + self._phi)))
         return 2.0 * share - 1.0 if self.directions == "signed" else share
 
     def _reward(self, speed: float, action: np.ndarray) -> float:
@@ -116,8 +122,8 @@ class CheetahDirE(DirectionTask, name="cheetah-dir-e", id="ada/CheetahDir-E-v0")
         if self.drills:
             self._drilled = self.drills[self.np_random.integers(len(self.drills))]
 
-    def _context(self) -> float:
-        return self._drilled if self.drills else super()._context()
+    def _direction(self, step: int) -> float:
+        return self._drilled if self.drills else super()._direction(step)
 
     def _move(self, action: np.ndarray) -> float:
         if self.drills and self._step % THROWN_EVERY == 0:

@@ -10,7 +10,21 @@ import numpy as np
 
 from ada_diffuser.errors import AdaError, Cancelled, Detail, UnexpectedAnswer, from_detail
 from ada_diffuser.faces.proxy import Proxy
-from ada_diffuser.messages import ActCall, Chunk, Missing, Model, SamplerOptions, SessionSummary, Start, Timings, Trained
+from ada_diffuser.messages import (
+    ActCall,
+    Chunk,
+    Missing,
+    Model,
+    Returns,
+    SamplerOptions,
+    SessionSummary,
+    Start,
+    Timings,
+    Told,
+    Trained,
+    TrueContext,
+)
+from ada_diffuser.options import MODE, NUMBERS, Kind
 from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
 from ada_diffuser.values import Floats
 
@@ -143,21 +157,28 @@ def _act_request(call: ActCall) -> agent_pb2.ActRequest:
             out.action.values.extend(step.action.tolist())
         if step.reward is not None:
             out.reward = step.reward
+    if call.context is not None:
+        rows, columns = call.context.shape
+        request.observation.context.CopyFrom(agent_pb2.Matrix(values=call.context.ravel().tolist(), rows=rows, columns=columns))
     return request
 
 
+_SPELL: dict[Kind, Callable[[Any], Any]] = {
+    MODE: lambda mode: f"LATENT_MODE_{mode.upper()}",
+    NUMBERS: lambda values: models_pb2.Vector(values=values),
+}
+_READ: dict[Kind, Callable[[Any], Any]] = {
+    MODE: lambda mode: "sample" if mode == models_pb2.LATENT_MODE_SAMPLE else "mean",
+    NUMBERS: lambda vector: tuple(vector.values),
+}
+
+
 def _options_out(options: SamplerOptions) -> models_pb2.SamplerOptions:
-    given = options.given()
-    if "latent" in given:
-        given["latent"] = f"LATENT_MODE_{given['latent'].upper()}"
-    return models_pb2.SamplerOptions(**given)
+    return models_pb2.SamplerOptions(**options.sent(_SPELL))
 
 
 def _options_in(options: models_pb2.SamplerOptions) -> SamplerOptions:
-    given: dict[str, Any] = {field.name: value for field, value in options.ListFields()}
-    if "latent" in given:
-        given["latent"] = "sample" if given["latent"] == models_pb2.LATENT_MODE_SAMPLE else "mean"
-    return SamplerOptions(**given)
+    return SamplerOptions.received({field.name: value for field, value in options.ListFields()}, _READ)
 
 
 def _floats(values: Any) -> Floats:
@@ -194,6 +215,9 @@ def _chunk(answer: agent_pb2.ActResponse) -> Chunk:
         model=answer.model,
         model_digest=answer.model_digest,
         degraded=answer.degraded,
+        passes=answer.passes,
+        value=answer.value if answer.HasField("value") else None,
+        value_spread=answer.value_spread if answer.HasField("value_spread") else None,
     )
 
 
@@ -214,7 +238,19 @@ def _model(model: models_pb2.Model) -> Model:
         sampler=_options_in(model.sampler),
         refined=model.refined,
         trained=_trained(model.trained),
+        told=tuple(_told(told) for told in model.told),
+        returns=Returns(model.returns.mean, model.returns.std) if model.HasField("returns") else None,
+        guide=model.guide,
+        context=_true_context(model.context) if model.HasField("context") else None,
     )
+
+
+def _told(told: models_pb2.Told) -> Told:
+    return Told("goal" if told.kind == models_pb2.TOLD_KIND_GOAL else "return", tuple(told.columns))
+
+
+def _true_context(context: models_pb2.TrueContext) -> TrueContext:
+    return TrueContext(context.dim, "known" if context.future == models_pb2.TRUE_FUTURE_KNOWN else "held")
 
 
 def _trained(trained: models_pb2.Trained) -> Trained:

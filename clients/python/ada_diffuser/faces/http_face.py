@@ -12,22 +12,17 @@ from __future__ import annotations
 import http.client
 import io
 import json
-import math
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import quote, urlencode
 
-import numpy as np
-
 from ada_diffuser.errors import AdaError, DeadlineExceeded, Detail, Unavailable, UnexpectedAnswer, from_detail
-from ada_diffuser.messages import ActCall, Chunk, Missing, Model, SamplerOptions, SessionSummary, Timings, Trained
-from ada_diffuser.values import Floats
-
-T = TypeVar("T")
+from ada_diffuser.faces import http_json
+from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary
 
 #: A longer body is announced before it is sent: a server that finds it too large says so, and need not be sent all of it.
 _ANNOUNCED_LEN = 256 * 1024
@@ -48,42 +43,41 @@ class HttpFace:
     def open_session(
         self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, request_id: str, timeout_s: float
     ) -> tuple[SessionSummary, Model]:
-        options_out = _options_out(options) or None
-        body = _without_none(model=model or None, seed=seed, options=options_out, ttl_ms=ttl_ms, request_id=request_id)
+        options_out = http_json.options_out(options) or None
+        body = http_json.without_none(model=model or None, seed=seed, options=options_out, ttl_ms=ttl_ms, request_id=request_id)
         answer = self._call("POST", "/v1/sessions", body, timeout_s)
-        return _read(_summary, answer, "session"), _read(_model, answer, "model")
+        return http_json.read(http_json.summary, answer, "session"), http_json.read(http_json.model, answer, "model")
 
     def act(self, call: ActCall, timeout_s: float) -> Chunk:
-        body = _act_body(call)
-        return _read(_chunk, self._call("POST", f"/v1/sessions/{_quoted(call.session_id)}/act", body, timeout_s))
+        body = http_json.act_body(call)
+        return http_json.read(http_json.chunk, self._call("POST", f"/v1/sessions/{_quoted(call.session_id)}/act", body, timeout_s))
 
     def act_batch(self, calls: Sequence[ActCall], timeout_s: float) -> list[Chunk | AdaError]:
-        body = {"acts": [{"session_id": call.session_id, **_act_body(call)} for call in calls]}
-        return _read(_results, self._call("POST", "/v1/act:batch", body, timeout_s), "results")
+        body = {"acts": [{"session_id": call.session_id, **http_json.act_body(call)} for call in calls]}
+        return http_json.read(http_json.results, self._call("POST", "/v1/act:batch", body, timeout_s), "results")
 
     def reset_session(
         self, session_id: str, seed: int | None, keep_history: bool, request_id: str, episode: int, timeout_s: float
     ) -> SessionSummary:
         path = f"/v1/sessions/{_quoted(session_id)}/reset"
-        body = _without_none(seed=seed, keep_history=keep_history or None, request_id=request_id, episode=episode)
-        return _read(_summary, self._call("POST", path, body, timeout_s), "session")
+        body = http_json.without_none(seed=seed, keep_history=keep_history or None, request_id=request_id, episode=episode)
+        return http_json.read(http_json.summary, self._call("POST", path, body, timeout_s), "session")
 
     def get_session(self, session_id: str, timeout_s: float) -> SessionSummary:
-        return _read(_summary, self._call("GET", f"/v1/sessions/{_quoted(session_id)}", None, timeout_s), "session")
+        return http_json.read(http_json.summary, self._call("GET", f"/v1/sessions/{_quoted(session_id)}", None, timeout_s), "session")
 
     def list_sessions(self, model: str, page_size: int, page_token: str, timeout_s: float) -> tuple[list[SessionSummary], str]:
-        wanted = _without_none(model=model or None, page_size=page_size or None, page_token=page_token or None)
+        wanted = http_json.without_none(model=model or None, page_size=page_size or None, page_token=page_token or None)
         answer = self._call("GET", "/v1/sessions?" + urlencode({"view": "full", **wanted}), None, timeout_s)
-        return _read(lambda sessions: [_summary({"session_id": "", **session}) for session in sessions], answer, "sessions"), _read(
-            str, answer, "next_page_token"
-        )
+        sessions = http_json.read(lambda listed: [http_json.summary({"session_id": "", **one}) for one in listed], answer, "sessions")
+        return sessions, http_json.read(str, answer, "next_page_token")
 
     def close_session(self, session_id: str, timeout_s: float) -> None:
         self._call("DELETE", f"/v1/sessions/{_quoted(session_id)}", None, timeout_s)
 
     def models(self, timeout_s: float) -> list[Model]:
         answer = self._call("GET", "/v1/models", None, timeout_s)
-        return _read(lambda models: [_model(model) for model in models], answer, "models")
+        return http_json.read(lambda models: [http_json.model(model) for model in models], answer, "models")
 
     def model(self, name: str, timeout_s: float) -> Model:
         if not name:  # an empty name has no path of its own: the default model is marked in the list
@@ -91,7 +85,7 @@ class HttpFace:
             if not models:
                 raise from_detail(Detail("the server has no default model", "MODEL_NOT_FOUND"))
             return models[0]
-        return _read(_model, self._call("GET", f"/v1/models/{_quoted(name)}", None, timeout_s), "model")
+        return http_json.read(http_json.model, self._call("GET", f"/v1/models/{_quoted(name)}", None, timeout_s), "model")
 
     def close(self) -> None:
         with self._lock:
@@ -111,7 +105,7 @@ class HttpFace:
         if 200 <= status < 300 and isinstance(answer, dict):
             return answer
         if isinstance(answer, dict):
-            raise _error_of_problem(answer, status)
+            raise http_json.error_of_problem(answer, status)
         after_s = headers.get("Retry-After", "")
         detail = Detail(
             f"status {status} from {self._host}:{self._port}, and no JSON object",
@@ -244,124 +238,3 @@ def _is_alive(idle: socket.socket) -> bool:
 
 def _quoted(word: str) -> str:
     return quote(word, safe="@")
-
-
-def _without_none(**pairs: Any) -> dict[str, Any]:
-    return {name: value for name, value in pairs.items() if value is not None}
-
-
-def _act_body(call: ActCall) -> dict[str, Any]:
-    executed = [
-        _without_none(
-            state=None if step.state is None else step.state.tolist(),
-            action=None if step.action is None else step.action.tolist(),
-            reward=step.reward,
-        )
-        for step in call.executed
-    ]
-    return _without_none(
-        step=call.step,
-        episode=call.episode,
-        observation=_without_none(state=call.state.tolist(), executed=executed, nothing_executed=call.nothing_executed or None),
-        deadline_ms=call.deadline_ms,
-        want_planned_states=call.want_planned_states or None,
-    )
-
-
-def _options_out(options: SamplerOptions) -> dict[str, Any]:
-    given = options.given()
-    if given.get("kappa") == math.inf:
-        given["kappa"] = "infinity"
-    return given
-
-
-def _options_in(options: Mapping[str, Any]) -> SamplerOptions:
-    given = {name: options[name] for name in SamplerOptions.__dataclass_fields__ if options.get(name) is not None}
-    if given.get("kappa") == "infinity":
-        given["kappa"] = math.inf
-    for name in {"eta", "temperature", "kappa"} & set(given):
-        given[name] = float(np.float32(given[name]))
-    return SamplerOptions(**given)
-
-
-def _read(convert: Callable[[Any], T], answer: Any, *path: str) -> T:
-    """`convert(answer[path])`; an answer of another shape is an error, not a KeyError in the caller's program."""
-    try:
-        for name in path:
-            answer = answer[name]
-        return convert(answer)
-    except (KeyError, TypeError, ValueError) as error:
-        raise UnexpectedAnswer(f"the answer is not of the expected shape ({type(error).__name__}: {error})") from None
-
-
-def _error_of_problem(problem: Mapping[str, Any], status: int) -> AdaError:
-    detail = Detail(
-        message=str(problem.get("detail") or problem.get("title") or f"status {status}"),
-        reason=str(problem.get("reason") or ""),
-        field=str(problem.get("field") or ""),
-        committed_step=problem.get("committed_step"),
-        retry_after_ms=problem.get("retry_after_ms"),
-        error_id=str(problem.get("error_id") or ""),
-    )
-    return from_detail(detail, http_status=status)
-
-
-def _floats(values: Any) -> Floats:
-    return np.array(values, dtype=np.float32)
-
-
-def _results(results: Sequence[Mapping[str, Any]]) -> list[Chunk | AdaError]:
-    return [
-        _chunk(result["response"])
-        if result.get("response") is not None
-        else _error_of_problem(result["error"], int(result["error"].get("status", 500)))
-        for result in results
-    ]
-
-
-def _chunk(answer: Mapping[str, Any]) -> Chunk:
-    timings = answer["timings"]
-    planned = answer.get("planned_states")
-    return Chunk(
-        session_id=answer["session_id"],
-        step=answer["step"],
-        replayed=answer["replayed"],
-        actions=_floats(answer["actions"]),
-        planned_states=None if planned is None else _floats(planned),
-        latent_mean=_floats(answer["latent_mean"]),
-        latent_log_var=_floats(answer["latent_log_var"]),
-        predicted_state=_floats(answer["predicted_state"]),
-        evaluations=answer["evaluations"],
-        start=answer["start"],
-        renoised_rungs=answer.get("renoised_rungs", 0),
-        timings=Timings(timings["queue_us"], timings["compute_us"], timings["commit_us"], timings["total_us"]),
-        model=answer["model"],
-        model_digest=answer["model_digest"],
-        degraded=answer.get("degraded", False),
-    )
-
-
-def _model(model: Mapping[str, Any]) -> Model:
-    special = ("action_low", "action_high", "sampler", "trained")
-    plain = {name: model[name] for name in Model.__dataclass_fields__ if name not in special}
-    trained = model["trained"]
-    return Model(
-        **plain,
-        action_low=_floats(model["action_low"]),
-        action_high=_floats(model["action_high"]),
-        sampler=_options_in(model["sampler"]),
-        trained=Trained(tuple(trained["action_horizons"]), tuple(trained["sub_steps"]), Missing(**trained["missing"]), trained["sessions"]),
-    )
-
-
-def _summary(session: Mapping[str, Any]) -> SessionSummary:
-    special = ("options", "latent_mean", "latent_log_var")
-    # Servers before 0.1 have no handles.
-    session = {"handle": "", **session}
-    plain = {name: session[name] for name in SessionSummary.__dataclass_fields__ if name not in special}
-    return SessionSummary(
-        **plain,
-        options=_options_in(session["options"]),
-        latent_mean=_floats(session["latent_mean"]),
-        latent_log_var=_floats(session["latent_log_var"]),
-    )

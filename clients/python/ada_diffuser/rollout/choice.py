@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ada_diffuser.messages import SamplerOptions
+from ada_diffuser.options import SamplerOptions, several, word
 from ada_diffuser.rollout.result import Evaluation
 
 #: Values tried where nothing else is said; the checkpoint's own join them.
@@ -93,7 +93,7 @@ def grid(words: Mapping[str, str], facts: Facts) -> list[Setting]:
     ValueError for a wrong one, and where there is none to compare with.
     """
     choices = {name: _sensible(name, [*values, facts.own[name]], facts) for name, values in GRID.items()}
-    choices |= {name: [value.strip() for value in values.split(",")] for name, values in words.items()}
+    choices |= {name: several(values) for name, values in words.items()}
     choices["streaming"] = [value.lower() for value in choices["streaming"]]
     if "false" not in choices["streaming"]:
         raise ValueError("cold is the reference: false must be among the values of streaming")
@@ -126,11 +126,6 @@ def _distance(name: str, text: str) -> float:
     if isinstance(value, str) or not value >= 0:
         raise ValueError(f"option {name}: {text!r} is not a number of at least 0, or inf")
     return value
-
-
-def word(value: object) -> str:
-    """A value as a command line has it; float32 in as many digits as tell it."""
-    return f"{value:.7g}" if isinstance(value, float) else str(value).lower()
 
 
 @dataclass(frozen=True, eq=False)

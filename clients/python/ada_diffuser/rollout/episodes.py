@@ -14,7 +14,8 @@ from ada_diffuser import environments
 from ada_diffuser.broker import ChunkBroker
 from ada_diffuser.client import Client
 from ada_diffuser.errors import AdaError
-from ada_diffuser.messages import Chunk, Model
+from ada_diffuser.messages import Chunk, Model, Observation
+from ada_diffuser.rollout.oracle import true_context
 from ada_diffuser.rollout.result import ActLog, Episode, Evaluation, Trial
 
 #: Called with the number of environment steps just made.
@@ -24,8 +25,8 @@ Progress = Callable[[int], object]
 def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: None) -> Evaluation:
     """Runs the trial's sessions, `trial.vector` of them side by side.
 
-    Rewards are reported with the actions, since a latent may live off them, unless the trial withholds them. Raises the
-    `AdaError` of the first act that cannot be had, and ValueError where environment and model do not fit.
+    Rewards are reported with the actions, since a latent may live off them, unless the trial withholds them. An oracle is told the true
+    context. Raises the `AdaError` of the first act that cannot be had, and ValueError where environment and model do not fit.
     """
     started = time.monotonic()
     acts, episodes = ActLog(), []
@@ -52,6 +53,8 @@ class _Lane:
         self.episodes: list[Episode] = []
         self._length = 0
         self.state = np.zeros(0, np.float32)
+        #: What the environment said last.
+        self._facts: dict[str, Any] = {}
 
     @property
     def episode(self) -> Episode:
@@ -66,10 +69,15 @@ class _Lane:
     def _begin(self, seed: int) -> None:
         """The next episode of the session with this seed: the environment goes on drawing where it was, and the model looks back."""
         index = len(self.episodes)
-        observation, _ = self.env.reset(seed=None if index else seed)
+        observation, self._facts = self.env.reset(seed=None if index else seed)
         self.broker.reset(_model_seed(seed, index), keep_history=index > 0 and not self._trial.forget)
         self.state = np.asarray(observation, np.float32)
         self.episodes.append(Episode(seed, index=index))
+
+    def observation(self) -> Observation:
+        """What the act that is due has to tell."""
+        session = self.broker.session
+        return self.broker.observation(self.state, context=true_context(self.env, self._facts, session.model, session.options))
 
     def accept(self, chunk: Chunk) -> None:
         """The answer of the act that was due."""
@@ -82,13 +90,13 @@ class _Lane:
     def step(self) -> None:
         """Executes the next action of the chunk and reports what came of it."""
         action = self.broker.take(self.state)
-        observation, reward, terminated, truncated, facts = self.env.step(action)
+        observation, reward, terminated, truncated, self._facts = self.env.step(action)
         self.broker.report(reward=None if self._trial.withhold_rewards else float(reward))
         self.episode.states.append(self.state)
         self.episode.actions.append(action)
         self.episode.rewards.append(float(reward))
-        if "context" in facts:
-            self.episode.contexts.append(np.atleast_1d(np.asarray(facts["context"], np.float32)).copy())
+        if "context" in self._facts:
+            self.episode.contexts.append(np.atleast_1d(np.asarray(self._facts["context"], np.float32)).copy())
         self.state = np.asarray(observation, np.float32)
         if terminated or truncated:
             self.episode.failed = environments.failed(self.env, self.episode.total)
@@ -121,6 +129,7 @@ def check(client: Client, trial: Trial) -> int:
     env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
     with closing(env), client.open_session(trial.model, seed=trial.seed, options=trial.options) as session:
         _check_fit(trial.env, env, session.model)
+        true_context(env, env.reset(seed=trial.seed)[1] if session.model.context else {}, session.model, session.options)
         if trial.session_episodes > 1 and not trial.forget:
             session.reset(trial.seed, keep_history=True)  # refused where the model was trained on episodes one by one
         return environments.steps_max(env)
@@ -146,13 +155,14 @@ def _run(client: Client, trial: Trial, lanes: list[_Lane], acts: ActLog, progres
 
 
 def _act(client: Client, trial: Trial, due: list[_Lane], acts: ActLog) -> None:
-    asked = [(lane.broker.session, lane.broker.observation(lane.state)) for lane in due]
+    asked = [(lane.broker.session, lane.observation()) for lane in due]
     started = time.perf_counter()
     if trial.vector > 1:
         answers = client.act_batch(asked, planned_states=trial.planned_states)
     else:
+        how = {"planned_states": trial.planned_states}
         answers = [
-            session.act(seen.state, seen.executed, nothing_executed=seen.nothing_executed, planned_states=trial.planned_states)
+            session.act(seen.state, seen.executed, nothing_executed=seen.nothing_executed, context=seen.context, **how)
             for session, seen in asked
         ]
     elapsed_s = time.perf_counter() - started

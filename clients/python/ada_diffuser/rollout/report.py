@@ -171,4 +171,6 @@ def rows_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _setting(value: object) -> str:
+    if isinstance(value, tuple):
+        return f"[{','.join(map(_setting, value))}]"
     return f"{value:g}" if isinstance(value, float) else str(value).lower()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -92,6 +92,10 @@ class ActLog:
     replayed: int = 0
     evaluations: int = 0
     timings: list[Timings] = field(default_factory=list)
+    #: Forwards that acts waited for, one after the other.
+    passes: int = 0
+    #: What the guide held each plan to be worth that it led or chose.
+    values: list[float] = field(default_factory=list)
 
     def add(self, elapsed_s: float, chunks: list[Chunk]) -> None:
         """One call and its answers. A replay spends nothing: its evaluations were those of the call that was lost."""
@@ -100,6 +104,8 @@ class ActLog:
         self.replayed += sum(chunk.replayed for chunk in chunks)
         self.evaluations += sum(chunk.evaluations for chunk in chunks)
         self.timings.extend(chunk.timings for chunk in chunks)
+        self.passes += sum(chunk.passes for chunk in chunks)
+        self.values.extend(chunk.value for chunk in chunks if chunk.value is not None)
 
     def joined(self, more: ActLog) -> ActLog:
         """Both together, as a new one."""
@@ -109,6 +115,8 @@ class ActLog:
             self.replayed + more.replayed,
             self.evaluations + more.evaluations,
             self.timings + more.timings,
+            self.passes + more.passes,
+            self.values + more.values,
         )
 
 
@@ -203,6 +211,15 @@ class Evaluation:
     def evaluations_per_act(self) -> float:
         return self.acts.evaluations / max(1, self.acts.acts)
 
+    @property
+    def passes_per_act(self) -> float:
+        return self.acts.passes / max(1, self.acts.acts)
+
+    @property
+    def mean_value(self) -> float | None:
+        """What the guide held the plans to be worth; None where it was not asked."""
+        return float(np.mean(self.acts.values)) if self.acts.values else None
+
     def latency_ms(self, percentile: float) -> float:
         """Of a call (an act, or a batch of them), as the client saw it."""
         return float(np.percentile(self.acts.call_ms, percentile))
@@ -221,7 +238,7 @@ class Evaluation:
             "seed": self.trial.seed,
             "vector": self.trial.vector,
             "withhold_rewards": self.trial.withhold_rewards,
-            "options": plain_options(asdict(self.options)),
+            "options": plain_options(self.options.given()),
             "returns": [round(value, 6) for value in self.returns.tolist()],
             "failed_seeds": [episode.seed for episode in self.episodes if episode.failed],
             "mean_return": round(self.mean_return, 6),
@@ -231,6 +248,8 @@ class Evaluation:
             "acts": self.acts.acts,
             "replayed": self.acts.replayed,
             "evaluations_per_act": self.evaluations_per_act,
+            "passes_per_act": self.passes_per_act,
+            **({} if self.mean_value is None else {"mean_value": round(self.mean_value, 6)}),
             "latency_ms": {"p50": self.latency_ms(50), "p99": self.latency_ms(99)},
             "server_ms": {
                 part: {"p50": self.server_ms(part, 50), "p99": self.server_ms(part, 99)} for part in ("queue", "compute", "commit", "total")

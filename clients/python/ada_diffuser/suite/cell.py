@@ -53,7 +53,8 @@ class Cell:
 
     def training(self, places: Places) -> Path:
         """The folder of its training, which other cells, of other suites too, may share."""
-        folder = f"{self.environment.name}-{self.recipe.stem}-{self._training_key}-seed{self.seed}"
+        stems = "-".join(path.stem for path in (self.recipe, *self.method.changes))
+        folder = f"{self.environment.name}-{stems}-{self._training_key}-seed{self.seed}"
         return places.runs / "trainings" / folder
 
     def data(self, places: Places) -> Path:
@@ -80,13 +81,18 @@ class Cell:
     @cached_property
     def _training_key(self) -> str:
         """ValueError where the recipe, or a data set that is not collected, cannot be read."""
-        try:
-            recipe = loads(self.recipe.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise ValueError(f"methods.{self.method.name}.recipe: {self.recipe}: {error}") from None
+        recipe = self._read("recipe", self.recipe)
+        changes = [self._read("with", path) for path in self.method.changes]
         told = {name: value for name, value in recipe.items() if name not in ("name", "data", "seed")}
         data = self._collected if self.environment.data is None else _known_digest(self.environment)
-        return _digest({"recipe": told, "set": self.method.training_keys, "seed": self.seed, "data": data})
+        changed = {"with": changes} if changes else {}
+        return _digest({"recipe": told, **changed, "set": self.method.training_keys, "seed": self.seed, "data": data})
+
+    def _read(self, key: str, path: Path) -> dict[str, Any]:
+        try:
+            return loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"methods.{self.method.name}.{key}: {path}: {error}") from None
 
     @property
     def _world(self) -> dict[str, Any]:

@@ -17,7 +17,10 @@ MODES: tuple[Mode, ...] = ("cold", "streaming")
 #: Names become names of files.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.,=+-]{0,99}")
 #: Keys of a recipe that say how a finished checkpoint is sampled: to change them trains nothing anew.
-_AFTERWARDS = re.compile(r"restart\.\w+|sampler\.(streaming|action_horizon|eta|temperature|kappa|latent)")
+_AFTERWARDS = re.compile(
+    r"restart\.\w+|sampler\.(streaming|action_horizon|eta|temperature|kappa|latent|guidance_\w+|free_guidance_scale|told_\w+"
+    r"|candidates|pick_temperature|picard_\w+)"
+)
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,8 @@ class Environment:
     #: Flags of `ada-collect`, without their dashes; None: `data` is there already.
     collect: Mapping[str, Any] | None
     data: Path | None
+    #: What methods change that name no recipe of their own.
+    recipe: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,8 @@ class Method:
     name: str
     #: By environment; one that is not named is none of this method's.
     recipes: Mapping[str, Path]
+    #: Files of methods, as `ada-trainer run --with` takes them.
+    changes: tuple[Path, ...]
     #: `KEY=VALUE`, as `ada-trainer run --set` takes them.
     keys: tuple[str, ...]
     modes: tuple[Mode, ...]
@@ -136,6 +143,7 @@ def _environment(name: str, table: Table) -> Environment:
     steps: int | None = table.take("episode_steps", int, None)
     collect: dict[str, Any] | None = table.take("collect", dict, None)
     data: str | None = table.take("data", str, None)
+    recipe: str | None = table.take("recipe", str, None)
     table.end()
     if (collect is None) == (data is None):
         raise table.wrong(
@@ -146,13 +154,18 @@ def _environment(name: str, table: Table) -> Environment:
             raise table.wrong(f"collect.{flag}", "is said by the suite itself; env, options and episode_steps stand beside collect")
         if not isinstance(value, (str, int, float)):
             raise table.wrong(f"collect.{flag}", f"must be what stands behind ada-collect --{flag}, not {value!r}")
-    return Environment(name, env, options, steps, collect, None if data is None else Path(data))
+    return Environment(name, env, options, steps, collect, _path(data), _path(recipe))
+
+
+def _path(text: str | None) -> Path | None:
+    return None if text is None else Path(text)
 
 
 def _methods(name: str, table: Table, environments: Mapping[str, Environment], modes: tuple[Mode, ...]) -> list[Method]:
     """The method, or with `vary` one for each value of each key."""
     _check_name(name)
     recipes = _recipes(table, environments)
+    changes = tuple(Path(path) for path in table.take("with", list[str], []))
     keys = tuple(table.take("set", list[str], []))
     modes = _modes(table, modes)
     vary: dict[str, Any] = table.take("vary", dict, {})
@@ -164,11 +177,11 @@ def _methods(name: str, table: Table, environments: Mapping[str, Environment], m
         if not isinstance(values, list) or not values:
             raise table.wrong(f"vary.{key}", f"must be a list of values, not {values!r}")
     if not vary:
-        return [Method(name, recipes, keys, modes, name)]
+        return [Method(name, recipes, changes, keys, modes, name)]
     variants = [(key, value, f"{key}={_word(value)}") for key, values in vary.items() for value in values]
     for _, _, text in variants:
         _check_name(f"{name},{text}")
-    return [Method(f"{name},{text}", recipes, (*keys, text), modes, name, (key, value)) for key, value, text in variants]
+    return [Method(f"{name},{text}", recipes, changes, (*keys, text), modes, name, (key, value)) for key, value, text in variants]
 
 
 def _word(value: Any) -> str:
@@ -177,8 +190,13 @@ def _word(value: Any) -> str:
 
 
 def _recipes(table: Table, environments: Mapping[str, Environment]) -> dict[str, Path]:
-    """`"models/{environment}/recipe.toml"`, or a table with a path for each environment of the method."""
-    given: Any = table.take("recipe", object)
+    """`"models/{environment}/recipe.toml"`, or a table with a path for each environment of the method; else the environments' own."""
+    given: Any = table.take("recipe", object, None)
+    if given is None:
+        own = {name: one.recipe for name, one in environments.items() if one.recipe is not None}
+        if not own:
+            raise table.wrong("recipe", "must be given: no environment has one of its own")
+        return own
     if isinstance(given, str):
         given = {name: given.replace("{environment}", name) for name in environments}
     if not isinstance(given, dict) or not all(isinstance(path, str) for path in given.values()):

@@ -75,6 +75,7 @@ def _facts(cell: Cell, told: dict[str, Any], data: Path) -> dict[str, Any]:
     recipe, card = loads(told["provenance"]["recipe"]), found(card_path(data)) or {}
     return {
         "recipe": str(cell.recipe),
+        "with": [str(path) for path in cell.method.changes],
         "set": list(cell.method.keys),
         "steps": {stage["name"]: stage["steps"] for stage in recipe["stages"]},
         "parameters": sum(told["parameters"].values()),
@@ -116,6 +117,7 @@ def _trained(cell: Cell, places: Places, programs: Programs, data: Path) -> tupl
             return seconds
 
         words = ["--seed", str(cell.seed), "--data", str(data), "--out", str(run)]
+        words += [text for path in cell.method.changes for text in ("--with", str(path))]
         words += [text for key in cell.method.training_keys for text in ("--set", key)]
         _say(f"trains {run}")
         _run("ada-trainer run", [programs.trainer, "run", str(cell.recipe), *words], spent)

@@ -24,62 +24,61 @@ _sym_db = _symbol_database.Default()
 
 from ada_diffuser.v1 import models_pb2 as ada__diffuser_dot_v1_dot_models__pb2
 
+from ada_diffuser.v1.models_pb2 import *
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1b\x61\x64\x61_diffuser/v1/agent.proto\x12\x0f\x61\x64\x61_diffuser.v1\x1a\x1c\x61\x64\x61_diffuser/v1/models.proto\"\xa5\x01\n\x12OpenSessionRequest\x12\r\n\x05model\x18\x01 \x01(\t\x12\x11\n\x04seed\x18\x02 \x01(\x04H\x00\x88\x01\x01\x12\x30\n\x07options\x18\x03 \x01(\x0b\x32\x1f.ada_diffuser.v1.SamplerOptions\x12\x13\n\x06ttl_ms\x18\x04 \x01(\x04H\x01\x88\x01\x01\x12\x12\n\nrequest_id\x18\x05 \x01(\tB\x07\n\x05_seedB\t\n\x07_ttl_ms\"g\n\x13OpenSessionResponse\x12)\n\x07session\x18\x01 \x01(\x0b\x32\x18.ada_diffuser.v1.Session\x12%\n\x05model\x18\x02 \x01(\x0b\x32\x16.ada_diffuser.v1.Model\"\xca\x01\n\nActRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x31\n\x0bobservation\x18\x03 \x01(\x0b\x32\x1c.ada_diffuser.v1.Observation\x12\x18\n\x0b\x64\x65\x61\x64line_ms\x18\x04 \x01(\rH\x00\x88\x01\x01\x12\x1b\n\x13want_planned_states\x18\x05 \x01(\x08\x12\x14\n\x07\x65pisode\x18\x06 \x01(\x04H\x01\x88\x01\x01\x42\x0e\n\x0c_deadline_msB\n\n\x08_episode\"c\n\x0bObservation\x12\r\n\x05state\x18\x01 \x03(\x02\x12+\n\x08\x65xecuted\x18\x02 \x03(\x0b\x32\x19.ada_diffuser.v1.Executed\x12\x18\n\x10nothing_executed\x18\x03 \x01(\x08\"\x9a\x01\n\x08\x45xecuted\x12+\n\x05state\x18\x01 \x01(\x0b\x32\x17.ada_diffuser.v1.VectorH\x00\x88\x01\x01\x12,\n\x06\x61\x63tion\x18\x02 \x01(\x0b\x32\x17.ada_diffuser.v1.VectorH\x01\x88\x01\x01\x12\x13\n\x06reward\x18\x03 \x01(\x02H\x02\x88\x01\x01\x42\x08\n\x06_stateB\t\n\x07_actionB\t\n\x07_reward\"\x18\n\x06Vector\x12\x0e\n\x06values\x18\x01 \x03(\x02\"7\n\x06Matrix\x12\x0e\n\x06values\x18\x01 \x03(\x02\x12\x0c\n\x04rows\x18\x02 \x01(\r\x12\x0f\n\x07\x63olumns\x18\x03 \x01(\r\"\xb0\x03\n\x0b\x41\x63tResponse\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x10\n\x08replayed\x18\x03 \x01(\x08\x12(\n\x07\x61\x63tions\x18\x04 \x01(\x0b\x32\x17.ada_diffuser.v1.Matrix\x12\x34\n\x0eplanned_states\x18\x05 \x01(\x0b\x32\x17.ada_diffuser.v1.MatrixH\x00\x88\x01\x01\x12\x13\n\x0blatent_mean\x18\x06 \x03(\x02\x12\x16\n\x0elatent_log_var\x18\x07 \x03(\x02\x12\x17\n\x0fpredicted_state\x18\x08 \x03(\x02\x12\x13\n\x0b\x65valuations\x18\t \x01(\r\x12%\n\x05start\x18\n \x01(\x0e\x32\x16.ada_diffuser.v1.Start\x12\x16\n\x0erenoised_rungs\x18\x0b \x01(\r\x12)\n\x07timings\x18\x0c \x01(\x0b\x32\x18.ada_diffuser.v1.Timings\x12\r\n\x05model\x18\r \x01(\t\x12\x14\n\x0cmodel_digest\x18\x0e \x01(\t\x12\x10\n\x08\x64\x65graded\x18\x0f \x01(\x08\x42\x11\n\x0f_planned_states\"T\n\x07Timings\x12\x10\n\x08queue_us\x18\x01 \x01(\x04\x12\x12\n\ncompute_us\x18\x02 \x01(\x04\x12\x11\n\tcommit_us\x18\x03 \x01(\x04\x12\x10\n\x08total_us\x18\x04 \x01(\x04\"\x92\x01\n\tActResult\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x30\n\x08response\x18\x03 \x01(\x0b\x32\x1c.ada_diffuser.v1.ActResponseH\x00\x12\'\n\x05\x65rror\x18\x04 \x01(\x0b\x32\x16.ada_diffuser.v1.ErrorH\x00\x42\x08\n\x06result\"\xd9\x01\n\x05\x45rror\x12\x0c\n\x04\x63ode\x18\x01 \x01(\x05\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\x12\r\n\x05\x66ield\x18\x04 \x01(\t\x12\x1b\n\x0e\x63ommitted_step\x18\x05 \x01(\x04H\x00\x88\x01\x01\x12\x1b\n\x0eretry_after_ms\x18\x06 \x01(\x04H\x01\x88\x01\x01\x12\x10\n\x08\x65rror_id\x18\x07 \x01(\t\x12\x14\n\x07\x65pisode\x18\x08 \x01(\x04H\x02\x88\x01\x01\x42\x11\n\x0f_committed_stepB\x11\n\x0f_retry_after_msB\n\n\x08_episode\"<\n\x0f\x41\x63tBatchRequest\x12)\n\x04\x61\x63ts\x18\x01 \x03(\x0b\x32\x1b.ada_diffuser.v1.ActRequest\"?\n\x10\x41\x63tBatchResponse\x12+\n\x07results\x18\x01 \x03(\x0b\x32\x1a.ada_diffuser.v1.ActResult\"\x91\x01\n\x13ResetSessionRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x11\n\x04seed\x18\x02 \x01(\x04H\x00\x88\x01\x01\x12\x14\n\x0ckeep_history\x18\x03 \x01(\x08\x12\x12\n\nrequest_id\x18\x04 \x01(\t\x12\x14\n\x07\x65pisode\x18\x05 \x01(\x04H\x01\x88\x01\x01\x42\x07\n\x05_seedB\n\n\x08_episode\"A\n\x14ResetSessionResponse\x12)\n\x07session\x18\x01 \x01(\x0b\x32\x18.ada_diffuser.v1.Session\"\'\n\x11GetSessionRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"?\n\x12GetSessionResponse\x12)\n\x07session\x18\x01 \x01(\x0b\x32\x18.ada_diffuser.v1.Session\"w\n\x13ListSessionsRequest\x12\x11\n\tpage_size\x18\x01 \x01(\r\x12\x12\n\npage_token\x18\x02 \x01(\t\x12\r\n\x05model\x18\x03 \x01(\t\x12*\n\x04view\x18\x04 \x01(\x0e\x32\x1c.ada_diffuser.v1.SessionView\"[\n\x14ListSessionsResponse\x12*\n\x08sessions\x18\x01 \x03(\x0b\x32\x18.ada_diffuser.v1.Session\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\")\n\x13\x43loseSessionRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"\x16\n\x14\x43loseSessionResponse\"\xbc\x02\n\x07Session\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\r\n\x05model\x18\x02 \x01(\t\x12\x14\n\x0cmodel_digest\x18\x03 \x01(\t\x12\x0c\n\x04seed\x18\x04 \x01(\x04\x12\x16\n\x0e\x63ommitted_step\x18\x05 \x01(\x04\x12\x0f\n\x07\x65pisode\x18\x06 \x01(\x04\x12\x30\n\x07options\x18\x07 \x01(\x0b\x32\x1f.ada_diffuser.v1.SamplerOptions\x12\x13\n\x0blatent_mean\x18\x08 \x03(\x02\x12\x16\n\x0elatent_log_var\x18\t \x03(\x02\x12\x0e\n\x06\x61ge_ms\x18\n \x01(\x04\x12\x0f\n\x07idle_ms\x18\x0b \x01(\x04\x12\x0e\n\x06ttl_ms\x18\x0c \x01(\x04\x12\x13\n\x0bstate_bytes\x18\r \x01(\x04\x12\x0c\n\x04\x62usy\x18\x0e \x01(\x08\x12\x0e\n\x06handle\x18\x0f \x01(\t*R\n\x05Start\x12\x15\n\x11START_UNSPECIFIED\x10\x00\x12\x0e\n\nSTART_COLD\x10\x01\x12\x0e\n\nSTART_WARM\x10\x02\x12\x12\n\x0eSTART_RENOISED\x10\x03*Z\n\x0bSessionView\x12\x1c\n\x18SESSION_VIEW_UNSPECIFIED\x10\x00\x12\x16\n\x12SESSION_VIEW_BASIC\x10\x01\x12\x15\n\x11SESSION_VIEW_FULL\x10\x02\x32\xac\x05\n\x05\x41gent\x12X\n\x0bOpenSession\x12#.ada_diffuser.v1.OpenSessionRequest\x1a$.ada_diffuser.v1.OpenSessionResponse\x12@\n\x03\x41\x63t\x12\x1b.ada_diffuser.v1.ActRequest\x1a\x1c.ada_diffuser.v1.ActResponse\x12H\n\tActStream\x12\x1b.ada_diffuser.v1.ActRequest\x1a\x1a.ada_diffuser.v1.ActResult(\x01\x30\x01\x12O\n\x08\x41\x63tBatch\x12 .ada_diffuser.v1.ActBatchRequest\x1a!.ada_diffuser.v1.ActBatchResponse\x12[\n\x0cResetSession\x12$.ada_diffuser.v1.ResetSessionRequest\x1a%.ada_diffuser.v1.ResetSessionResponse\x12U\n\nGetSession\x12\".ada_diffuser.v1.GetSessionRequest\x1a#.ada_diffuser.v1.GetSessionResponse\x12[\n\x0cListSessions\x12$.ada_diffuser.v1.ListSessionsRequest\x1a%.ada_diffuser.v1.ListSessionsResponse\x12[\n\x0c\x43loseSession\x12$.ada_diffuser.v1.CloseSessionRequest\x1a%.ada_diffuser.v1.CloseSessionResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1b\x61\x64\x61_diffuser/v1/agent.proto\x12\x0f\x61\x64\x61_diffuser.v1\x1a\x1c\x61\x64\x61_diffuser/v1/models.proto\"\xa5\x01\n\x12OpenSessionRequest\x12\r\n\x05model\x18\x01 \x01(\t\x12\x11\n\x04seed\x18\x02 \x01(\x04H\x00\x88\x01\x01\x12\x30\n\x07options\x18\x03 \x01(\x0b\x32\x1f.ada_diffuser.v1.SamplerOptions\x12\x13\n\x06ttl_ms\x18\x04 \x01(\x04H\x01\x88\x01\x01\x12\x12\n\nrequest_id\x18\x05 \x01(\tB\x07\n\x05_seedB\t\n\x07_ttl_ms\"g\n\x13OpenSessionResponse\x12)\n\x07session\x18\x01 \x01(\x0b\x32\x18.ada_diffuser.v1.Session\x12%\n\x05model\x18\x02 \x01(\x0b\x32\x16.ada_diffuser.v1.Model\"\xca\x01\n\nActRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x31\n\x0bobservation\x18\x03 \x01(\x0b\x32\x1c.ada_diffuser.v1.Observation\x12\x18\n\x0b\x64\x65\x61\x64line_ms\x18\x04 \x01(\rH\x00\x88\x01\x01\x12\x1b\n\x13want_planned_states\x18\x05 \x01(\x08\x12\x14\n\x07\x65pisode\x18\x06 \x01(\x04H\x01\x88\x01\x01\x42\x0e\n\x0c_deadline_msB\n\n\x08_episode\"\x9e\x01\n\x0bObservation\x12\r\n\x05state\x18\x01 \x03(\x02\x12+\n\x08\x65xecuted\x18\x02 \x03(\x0b\x32\x19.ada_diffuser.v1.Executed\x12\x18\n\x10nothing_executed\x18\x03 \x01(\x08\x12-\n\x07\x63ontext\x18\x04 \x01(\x0b\x32\x17.ada_diffuser.v1.MatrixH\x00\x88\x01\x01\x42\n\n\x08_context\"\x9a\x01\n\x08\x45xecuted\x12+\n\x05state\x18\x01 \x01(\x0b\x32\x17.ada_diffuser.v1.VectorH\x00\x88\x01\x01\x12,\n\x06\x61\x63tion\x18\x02 \x01(\x0b\x32\x17.ada_diffuser.v1.VectorH\x01\x88\x01\x01\x12\x13\n\x06reward\x18\x03 \x01(\x02H\x02\x88\x01\x01\x42\x08\n\x06_stateB\t\n\x07_actionB\t\n\x07_reward\"7\n\x06Matrix\x12\x0e\n\x06values\x18\x01 \x03(\x02\x12\x0c\n\x04rows\x18\x02 \x01(\r\x12\x0f\n\x07\x63olumns\x18\x03 \x01(\r\"\x8a\x04\n\x0b\x41\x63tResponse\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x10\n\x08replayed\x18\x03 \x01(\x08\x12(\n\x07\x61\x63tions\x18\x04 \x01(\x0b\x32\x17.ada_diffuser.v1.Matrix\x12\x34\n\x0eplanned_states\x18\x05 \x01(\x0b\x32\x17.ada_diffuser.v1.MatrixH\x00\x88\x01\x01\x12\x13\n\x0blatent_mean\x18\x06 \x03(\x02\x12\x16\n\x0elatent_log_var\x18\x07 \x03(\x02\x12\x17\n\x0fpredicted_state\x18\x08 \x03(\x02\x12\x13\n\x0b\x65valuations\x18\t \x01(\r\x12%\n\x05start\x18\n \x01(\x0e\x32\x16.ada_diffuser.v1.Start\x12\x16\n\x0erenoised_rungs\x18\x0b \x01(\r\x12)\n\x07timings\x18\x0c \x01(\x0b\x32\x18.ada_diffuser.v1.Timings\x12\r\n\x05model\x18\r \x01(\t\x12\x14\n\x0cmodel_digest\x18\x0e \x01(\t\x12\x10\n\x08\x64\x65graded\x18\x0f \x01(\x08\x12\x0e\n\x06passes\x18\x10 \x01(\r\x12\x12\n\x05value\x18\x11 \x01(\x02H\x01\x88\x01\x01\x12\x19\n\x0cvalue_spread\x18\x12 \x01(\x02H\x02\x88\x01\x01\x42\x11\n\x0f_planned_statesB\x08\n\x06_valueB\x0f\n\r_value_spread\"T\n\x07Timings\x12\x10\n\x08queue_us\x18\x01 \x01(\x04\x12\x12\n\ncompute_us\x18\x02 \x01(\x04\x12\x11\n\tcommit_us\x18\x03 \x01(\x04\x12\x10\n\x08total_us\x18\x04 \x01(\x04\"\x92\x01\n\tActResult\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x30\n\x08response\x18\x03 \x01(\x0b\x32\x1c.ada_diffuser.v1.ActResponseH\x00\x12\'\n\x05\x65rror\x18\x04 \x01(\x0b\x32\x16.ada_diffuser.v1.ErrorH\x00\x42\x08\n\x06result\"\xd9\x01\n\x05\x45rror\x12\x0c\n\x04\x63ode\x18\x01 \x01(\x05\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\x12\r\n\x05\x66ield\x18\x04 \x01(\t\x12\x1b\n\x0e\x63ommitted_step\x18\x05 \x01(\x04H\x00\x88\x01\x01\x12\x1b\n\x0eretry_after_ms\x18\x06 \x01(\x04H\x01\x88\x01\x01\x12\x10\n\x08\x65rror_id\x18\x07 \x01(\t\x12\x14\n\x07\x65pisode\x18\x08 \x01(\x04H\x02\x88\x01\x01\x42\x11\n\x0f_committed_stepB\x11\n\x0f_retry_after_msB\n\n\x08_episode\"<\n\x0f\x41\x63tBatchRequest\x12)\n\x04\x61\x63ts\x18\x01 \x03(\x0b\x32\x1b.ada_diffuser.v1.ActRequest\"?\n\x10\x41\x63tBatchResponse\x12+\n\x07results\x18\x01 \x03(\x0b\x32\x1a.ada_diffuser.v1.ActResult\"\x91\x01\n\x13ResetSessionRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x11\n\x04seed\x18\x02 \x01(\x04H\x00\x88\x01\x01\x12\x14\n\x0ckeep_history\x18\x03 \x01(\x08\x12\x12\n\nrequest_id\x18\x04 \x01(\t\x12\x14\n\x07\x65pisode\x18\x05 \x01(\x04H\x01\x88\x01\x01\x42\x07\n\x05_seedB\n\n\x08_episode\"A\n\x14ResetSessionResponse\x12)\n\x07session\x18\x01 \x01(\x0b\x32\x18.ada_diffuser.v1.Session\"\'\n\x11GetSessionRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"?\n\x12GetSessionResponse\x12)\n\x07session\x18\x01 \x01(\x0b\x32\x18.ada_diffuser.v1.Session\"w\n\x13ListSessionsRequest\x12\x11\n\tpage_size\x18\x01 \x01(\r\x12\x12\n\npage_token\x18\x02 \x01(\t\x12\r\n\x05model\x18\x03 \x01(\t\x12*\n\x04view\x18\x04 \x01(\x0e\x32\x1c.ada_diffuser.v1.SessionView\"[\n\x14ListSessionsResponse\x12*\n\x08sessions\x18\x01 \x03(\x0b\x32\x18.ada_diffuser.v1.Session\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\")\n\x13\x43loseSessionRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"\x16\n\x14\x43loseSessionResponse\"\xbc\x02\n\x07Session\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\r\n\x05model\x18\x02 \x01(\t\x12\x14\n\x0cmodel_digest\x18\x03 \x01(\t\x12\x0c\n\x04seed\x18\x04 \x01(\x04\x12\x16\n\x0e\x63ommitted_step\x18\x05 \x01(\x04\x12\x0f\n\x07\x65pisode\x18\x06 \x01(\x04\x12\x30\n\x07options\x18\x07 \x01(\x0b\x32\x1f.ada_diffuser.v1.SamplerOptions\x12\x13\n\x0blatent_mean\x18\x08 \x03(\x02\x12\x16\n\x0elatent_log_var\x18\t \x03(\x02\x12\x0e\n\x06\x61ge_ms\x18\n \x01(\x04\x12\x0f\n\x07idle_ms\x18\x0b \x01(\x04\x12\x0e\n\x06ttl_ms\x18\x0c \x01(\x04\x12\x13\n\x0bstate_bytes\x18\r \x01(\x04\x12\x0c\n\x04\x62usy\x18\x0e \x01(\x08\x12\x0e\n\x06handle\x18\x0f \x01(\t*R\n\x05Start\x12\x15\n\x11START_UNSPECIFIED\x10\x00\x12\x0e\n\nSTART_COLD\x10\x01\x12\x0e\n\nSTART_WARM\x10\x02\x12\x12\n\x0eSTART_RENOISED\x10\x03*Z\n\x0bSessionView\x12\x1c\n\x18SESSION_VIEW_UNSPECIFIED\x10\x00\x12\x16\n\x12SESSION_VIEW_BASIC\x10\x01\x12\x15\n\x11SESSION_VIEW_FULL\x10\x02\x32\xac\x05\n\x05\x41gent\x12X\n\x0bOpenSession\x12#.ada_diffuser.v1.OpenSessionRequest\x1a$.ada_diffuser.v1.OpenSessionResponse\x12@\n\x03\x41\x63t\x12\x1b.ada_diffuser.v1.ActRequest\x1a\x1c.ada_diffuser.v1.ActResponse\x12H\n\tActStream\x12\x1b.ada_diffuser.v1.ActRequest\x1a\x1a.ada_diffuser.v1.ActResult(\x01\x30\x01\x12O\n\x08\x41\x63tBatch\x12 .ada_diffuser.v1.ActBatchRequest\x1a!.ada_diffuser.v1.ActBatchResponse\x12[\n\x0cResetSession\x12$.ada_diffuser.v1.ResetSessionRequest\x1a%.ada_diffuser.v1.ResetSessionResponse\x12U\n\nGetSession\x12\".ada_diffuser.v1.GetSessionRequest\x1a#.ada_diffuser.v1.GetSessionResponse\x12[\n\x0cListSessions\x12$.ada_diffuser.v1.ListSessionsRequest\x1a%.ada_diffuser.v1.ListSessionsResponse\x12[\n\x0c\x43loseSession\x12$.ada_diffuser.v1.CloseSessionRequest\x1a%.ada_diffuser.v1.CloseSessionResponseP\x00\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'ada_diffuser.v1.agent_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_START']._serialized_start=2835
-  _globals['_START']._serialized_end=2917
-  _globals['_SESSIONVIEW']._serialized_start=2919
-  _globals['_SESSIONVIEW']._serialized_end=3009
+  _globals['_START']._serialized_start=2959
+  _globals['_START']._serialized_end=3041
+  _globals['_SESSIONVIEW']._serialized_start=3043
+  _globals['_SESSIONVIEW']._serialized_end=3133
   _globals['_OPENSESSIONREQUEST']._serialized_start=79
   _globals['_OPENSESSIONREQUEST']._serialized_end=244
   _globals['_OPENSESSIONRESPONSE']._serialized_start=246
   _globals['_OPENSESSIONRESPONSE']._serialized_end=349
   _globals['_ACTREQUEST']._serialized_start=352
   _globals['_ACTREQUEST']._serialized_end=554
-  _globals['_OBSERVATION']._serialized_start=556
-  _globals['_OBSERVATION']._serialized_end=655
-  _globals['_EXECUTED']._serialized_start=658
-  _globals['_EXECUTED']._serialized_end=812
-  _globals['_VECTOR']._serialized_start=814
-  _globals['_VECTOR']._serialized_end=838
-  _globals['_MATRIX']._serialized_start=840
-  _globals['_MATRIX']._serialized_end=895
-  _globals['_ACTRESPONSE']._serialized_start=898
-  _globals['_ACTRESPONSE']._serialized_end=1330
-  _globals['_TIMINGS']._serialized_start=1332
-  _globals['_TIMINGS']._serialized_end=1416
-  _globals['_ACTRESULT']._serialized_start=1419
-  _globals['_ACTRESULT']._serialized_end=1565
-  _globals['_ERROR']._serialized_start=1568
-  _globals['_ERROR']._serialized_end=1785
-  _globals['_ACTBATCHREQUEST']._serialized_start=1787
-  _globals['_ACTBATCHREQUEST']._serialized_end=1847
-  _globals['_ACTBATCHRESPONSE']._serialized_start=1849
-  _globals['_ACTBATCHRESPONSE']._serialized_end=1912
-  _globals['_RESETSESSIONREQUEST']._serialized_start=1915
-  _globals['_RESETSESSIONREQUEST']._serialized_end=2060
-  _globals['_RESETSESSIONRESPONSE']._serialized_start=2062
-  _globals['_RESETSESSIONRESPONSE']._serialized_end=2127
-  _globals['_GETSESSIONREQUEST']._serialized_start=2129
-  _globals['_GETSESSIONREQUEST']._serialized_end=2168
-  _globals['_GETSESSIONRESPONSE']._serialized_start=2170
-  _globals['_GETSESSIONRESPONSE']._serialized_end=2233
-  _globals['_LISTSESSIONSREQUEST']._serialized_start=2235
-  _globals['_LISTSESSIONSREQUEST']._serialized_end=2354
-  _globals['_LISTSESSIONSRESPONSE']._serialized_start=2356
-  _globals['_LISTSESSIONSRESPONSE']._serialized_end=2447
-  _globals['_CLOSESESSIONREQUEST']._serialized_start=2449
-  _globals['_CLOSESESSIONREQUEST']._serialized_end=2490
-  _globals['_CLOSESESSIONRESPONSE']._serialized_start=2492
-  _globals['_CLOSESESSIONRESPONSE']._serialized_end=2514
-  _globals['_SESSION']._serialized_start=2517
-  _globals['_SESSION']._serialized_end=2833
-  _globals['_AGENT']._serialized_start=3012
-  _globals['_AGENT']._serialized_end=3696
+  _globals['_OBSERVATION']._serialized_start=557
+  _globals['_OBSERVATION']._serialized_end=715
+  _globals['_EXECUTED']._serialized_start=718
+  _globals['_EXECUTED']._serialized_end=872
+  _globals['_MATRIX']._serialized_start=874
+  _globals['_MATRIX']._serialized_end=929
+  _globals['_ACTRESPONSE']._serialized_start=932
+  _globals['_ACTRESPONSE']._serialized_end=1454
+  _globals['_TIMINGS']._serialized_start=1456
+  _globals['_TIMINGS']._serialized_end=1540
+  _globals['_ACTRESULT']._serialized_start=1543
+  _globals['_ACTRESULT']._serialized_end=1689
+  _globals['_ERROR']._serialized_start=1692
+  _globals['_ERROR']._serialized_end=1909
+  _globals['_ACTBATCHREQUEST']._serialized_start=1911
+  _globals['_ACTBATCHREQUEST']._serialized_end=1971
+  _globals['_ACTBATCHRESPONSE']._serialized_start=1973
+  _globals['_ACTBATCHRESPONSE']._serialized_end=2036
+  _globals['_RESETSESSIONREQUEST']._serialized_start=2039
+  _globals['_RESETSESSIONREQUEST']._serialized_end=2184
+  _globals['_RESETSESSIONRESPONSE']._serialized_start=2186
+  _globals['_RESETSESSIONRESPONSE']._serialized_end=2251
+  _globals['_GETSESSIONREQUEST']._serialized_start=2253
+  _globals['_GETSESSIONREQUEST']._serialized_end=2292
+  _globals['_GETSESSIONRESPONSE']._serialized_start=2294
+  _globals['_GETSESSIONRESPONSE']._serialized_end=2357
+  _globals['_LISTSESSIONSREQUEST']._serialized_start=2359
+  _globals['_LISTSESSIONSREQUEST']._serialized_end=2478
+  _globals['_LISTSESSIONSRESPONSE']._serialized_start=2480
+  _globals['_LISTSESSIONSRESPONSE']._serialized_end=2571
+  _globals['_CLOSESESSIONREQUEST']._serialized_start=2573
+  _globals['_CLOSESESSIONREQUEST']._serialized_end=2614
+  _globals['_CLOSESESSIONRESPONSE']._serialized_start=2616
+  _globals['_CLOSESESSIONRESPONSE']._serialized_end=2638
+  _globals['_SESSION']._serialized_start=2641
+  _globals['_SESSION']._serialized_end=2957
+  _globals['_AGENT']._serialized_start=3136
+  _globals['_AGENT']._serialized_end=3820
 # @@protoc_insertion_point(module_scope)

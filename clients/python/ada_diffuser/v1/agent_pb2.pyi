@@ -5,8 +5,32 @@ from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+from ada_diffuser.v1.models_pb2 import ListModelsRequest as ListModelsRequest
+from ada_diffuser.v1.models_pb2 import ListModelsResponse as ListModelsResponse
+from ada_diffuser.v1.models_pb2 import GetModelRequest as GetModelRequest
+from ada_diffuser.v1.models_pb2 import GetModelResponse as GetModelResponse
+from ada_diffuser.v1.models_pb2 import Model as Model
+from ada_diffuser.v1.models_pb2 import Told as Told
+from ada_diffuser.v1.models_pb2 import Returns as Returns
+from ada_diffuser.v1.models_pb2 import TrueContext as TrueContext
+from ada_diffuser.v1.models_pb2 import Trained as Trained
+from ada_diffuser.v1.models_pb2 import Missing as Missing
+from ada_diffuser.v1.models_pb2 import Vector as Vector
+from ada_diffuser.v1.models_pb2 import SamplerOptions as SamplerOptions
+from ada_diffuser.v1.models_pb2 import ToldKind as ToldKind
+from ada_diffuser.v1.models_pb2 import TrueFuture as TrueFuture
+from ada_diffuser.v1.models_pb2 import LatentMode as LatentMode
 
 DESCRIPTOR: _descriptor.FileDescriptor
+TOLD_KIND_UNSPECIFIED: _models_pb2.ToldKind
+TOLD_KIND_RETURN: _models_pb2.ToldKind
+TOLD_KIND_GOAL: _models_pb2.ToldKind
+TRUE_FUTURE_UNSPECIFIED: _models_pb2.TrueFuture
+TRUE_FUTURE_HELD: _models_pb2.TrueFuture
+TRUE_FUTURE_KNOWN: _models_pb2.TrueFuture
+LATENT_MODE_UNSPECIFIED: _models_pb2.LatentMode
+LATENT_MODE_MEAN: _models_pb2.LatentMode
+LATENT_MODE_SAMPLE: _models_pb2.LatentMode
 
 class Start(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -67,30 +91,26 @@ class ActRequest(_message.Message):
     def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., observation: _Optional[_Union[Observation, _Mapping]] = ..., deadline_ms: _Optional[int] = ..., want_planned_states: bool = ..., episode: _Optional[int] = ...) -> None: ...
 
 class Observation(_message.Message):
-    __slots__ = ("state", "executed", "nothing_executed")
+    __slots__ = ("state", "executed", "nothing_executed", "context")
     STATE_FIELD_NUMBER: _ClassVar[int]
     EXECUTED_FIELD_NUMBER: _ClassVar[int]
     NOTHING_EXECUTED_FIELD_NUMBER: _ClassVar[int]
+    CONTEXT_FIELD_NUMBER: _ClassVar[int]
     state: _containers.RepeatedScalarFieldContainer[float]
     executed: _containers.RepeatedCompositeFieldContainer[Executed]
     nothing_executed: bool
-    def __init__(self, state: _Optional[_Iterable[float]] = ..., executed: _Optional[_Iterable[_Union[Executed, _Mapping]]] = ..., nothing_executed: bool = ...) -> None: ...
+    context: Matrix
+    def __init__(self, state: _Optional[_Iterable[float]] = ..., executed: _Optional[_Iterable[_Union[Executed, _Mapping]]] = ..., nothing_executed: bool = ..., context: _Optional[_Union[Matrix, _Mapping]] = ...) -> None: ...
 
 class Executed(_message.Message):
     __slots__ = ("state", "action", "reward")
     STATE_FIELD_NUMBER: _ClassVar[int]
     ACTION_FIELD_NUMBER: _ClassVar[int]
     REWARD_FIELD_NUMBER: _ClassVar[int]
-    state: Vector
-    action: Vector
+    state: _models_pb2.Vector
+    action: _models_pb2.Vector
     reward: float
-    def __init__(self, state: _Optional[_Union[Vector, _Mapping]] = ..., action: _Optional[_Union[Vector, _Mapping]] = ..., reward: _Optional[float] = ...) -> None: ...
-
-class Vector(_message.Message):
-    __slots__ = ("values",)
-    VALUES_FIELD_NUMBER: _ClassVar[int]
-    values: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, values: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, state: _Optional[_Union[_models_pb2.Vector, _Mapping]] = ..., action: _Optional[_Union[_models_pb2.Vector, _Mapping]] = ..., reward: _Optional[float] = ...) -> None: ...
 
 class Matrix(_message.Message):
     __slots__ = ("values", "rows", "columns")
@@ -103,7 +123,7 @@ class Matrix(_message.Message):
     def __init__(self, values: _Optional[_Iterable[float]] = ..., rows: _Optional[int] = ..., columns: _Optional[int] = ...) -> None: ...
 
 class ActResponse(_message.Message):
-    __slots__ = ("session_id", "step", "replayed", "actions", "planned_states", "latent_mean", "latent_log_var", "predicted_state", "evaluations", "start", "renoised_rungs", "timings", "model", "model_digest", "degraded")
+    __slots__ = ("session_id", "step", "replayed", "actions", "planned_states", "latent_mean", "latent_log_var", "predicted_state", "evaluations", "start", "renoised_rungs", "timings", "model", "model_digest", "degraded", "passes", "value", "value_spread")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     REPLAYED_FIELD_NUMBER: _ClassVar[int]
@@ -119,6 +139,9 @@ class ActResponse(_message.Message):
     MODEL_FIELD_NUMBER: _ClassVar[int]
     MODEL_DIGEST_FIELD_NUMBER: _ClassVar[int]
     DEGRADED_FIELD_NUMBER: _ClassVar[int]
+    PASSES_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    VALUE_SPREAD_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     step: int
     replayed: bool
@@ -134,7 +157,10 @@ class ActResponse(_message.Message):
     model: str
     model_digest: str
     degraded: bool
-    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., replayed: bool = ..., actions: _Optional[_Union[Matrix, _Mapping]] = ..., planned_states: _Optional[_Union[Matrix, _Mapping]] = ..., latent_mean: _Optional[_Iterable[float]] = ..., latent_log_var: _Optional[_Iterable[float]] = ..., predicted_state: _Optional[_Iterable[float]] = ..., evaluations: _Optional[int] = ..., start: _Optional[_Union[Start, str]] = ..., renoised_rungs: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., model: _Optional[str] = ..., model_digest: _Optional[str] = ..., degraded: bool = ...) -> None: ...
+    passes: int
+    value: float
+    value_spread: float
+    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., replayed: bool = ..., actions: _Optional[_Union[Matrix, _Mapping]] = ..., planned_states: _Optional[_Union[Matrix, _Mapping]] = ..., latent_mean: _Optional[_Iterable[float]] = ..., latent_log_var: _Optional[_Iterable[float]] = ..., predicted_state: _Optional[_Iterable[float]] = ..., evaluations: _Optional[int] = ..., start: _Optional[_Union[Start, str]] = ..., renoised_rungs: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., model: _Optional[str] = ..., model_digest: _Optional[str] = ..., degraded: bool = ..., passes: _Optional[int] = ..., value: _Optional[float] = ..., value_spread: _Optional[float] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("queue_us", "compute_us", "commit_us", "total_us")

@@ -24,15 +24,19 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1c\x61\x64\x61_diffuser/v1/models.proto\x12\x0f\x61\x64\x61_diffuser.v1\"\x13\n\x11ListModelsRequest\"<\n\x12ListModelsResponse\x12&\n\x06models\x18\x01 \x03(\x0b\x32\x16.ada_diffuser.v1.Model\" \n\x0fGetModelRequest\x12\r\n\x05model\x18\x01 \x01(\t\"9\n\x10GetModelResponse\x12%\n\x05model\x18\x01 \x01(\x0b\x32\x16.ada_diffuser.v1.Model\"\xdc\x02\n\x05Model\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x64igest\x18\x02 \x01(\t\x12\x12\n\nis_default\x18\x03 \x01(\x08\x12\x11\n\tstate_dim\x18\x04 \x01(\r\x12\x12\n\naction_dim\x18\x05 \x01(\r\x12\x14\n\x0cplan_horizon\x18\x06 \x01(\r\x12\x11\n\tblock_len\x18\x07 \x01(\r\x12\x13\n\x0bobs_horizon\x18\x08 \x01(\r\x12\x12\n\nlatent_dim\x18\t \x01(\r\x12\x11\n\tlevel_max\x18\n \x01(\r\x12\x12\n\naction_low\x18\x0b \x03(\x02\x12\x13\n\x0b\x61\x63tion_high\x18\x0c \x03(\x02\x12\x30\n\x07sampler\x18\r \x01(\x0b\x32\x1f.ada_diffuser.v1.SamplerOptions\x12\x0f\n\x07refined\x18\x0e \x01(\x08\x12)\n\x07trained\x18\x0f \x01(\x0b\x32\x18.ada_diffuser.v1.Trained\"r\n\x07Trained\x12\x17\n\x0f\x61\x63tion_horizons\x18\x01 \x03(\r\x12\x11\n\tsub_steps\x18\x02 \x03(\r\x12)\n\x07missing\x18\x03 \x01(\x0b\x32\x18.ada_diffuser.v1.Missing\x12\x10\n\x08sessions\x18\x04 \x01(\x08\"8\n\x07Missing\x12\r\n\x05state\x18\x01 \x01(\x08\x12\x0e\n\x06\x61\x63tion\x18\x02 \x01(\x08\x12\x0e\n\x06reward\x18\x03 \x01(\x08\"\xab\x02\n\x0eSamplerOptions\x12\x16\n\tstreaming\x18\x01 \x01(\x08H\x00\x88\x01\x01\x12\x1b\n\x0e\x61\x63tion_horizon\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x16\n\tsub_steps\x18\x03 \x01(\rH\x02\x88\x01\x01\x12\x10\n\x03\x65ta\x18\x04 \x01(\x02H\x03\x88\x01\x01\x12\x18\n\x0btemperature\x18\x05 \x01(\x02H\x04\x88\x01\x01\x12\x12\n\x05kappa\x18\x06 \x01(\x02H\x05\x88\x01\x01\x12\x30\n\x06latent\x18\x07 \x01(\x0e\x32\x1b.ada_diffuser.v1.LatentModeH\x06\x88\x01\x01\x42\x0c\n\n_streamingB\x11\n\x0f_action_horizonB\x0c\n\n_sub_stepsB\x06\n\x04_etaB\x0e\n\x0c_temperatureB\x08\n\x06_kappaB\t\n\x07_latent*W\n\nLatentMode\x12\x1b\n\x17LATENT_MODE_UNSPECIFIED\x10\x00\x12\x14\n\x10LATENT_MODE_MEAN\x10\x01\x12\x16\n\x12LATENT_MODE_SAMPLE\x10\x02\x32\xa5\x01\n\x06Models\x12O\n\x04List\x12\".ada_diffuser.v1.ListModelsRequest\x1a#.ada_diffuser.v1.ListModelsResponse\x12J\n\x03Get\x12 .ada_diffuser.v1.GetModelRequest\x1a!.ada_diffuser.v1.GetModelResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1c\x61\x64\x61_diffuser/v1/models.proto\x12\x0f\x61\x64\x61_diffuser.v1\"\x13\n\x11ListModelsRequest\"<\n\x12ListModelsResponse\x12&\n\x06models\x18\x01 \x03(\x0b\x32\x16.ada_diffuser.v1.Model\" \n\x0fGetModelRequest\x12\r\n\x05model\x18\x01 \x01(\t\"9\n\x10GetModelResponse\x12%\n\x05model\x18\x01 \x01(\x0b\x32\x16.ada_diffuser.v1.Model\"\x8c\x04\n\x05Model\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x64igest\x18\x02 \x01(\t\x12\x12\n\nis_default\x18\x03 \x01(\x08\x12\x11\n\tstate_dim\x18\x04 \x01(\r\x12\x12\n\naction_dim\x18\x05 \x01(\r\x12\x14\n\x0cplan_horizon\x18\x06 \x01(\r\x12\x11\n\tblock_len\x18\x07 \x01(\r\x12\x13\n\x0bobs_horizon\x18\x08 \x01(\r\x12\x12\n\nlatent_dim\x18\t \x01(\r\x12\x11\n\tlevel_max\x18\n \x01(\r\x12\x12\n\naction_low\x18\x0b \x03(\x02\x12\x13\n\x0b\x61\x63tion_high\x18\x0c \x03(\x02\x12\x30\n\x07sampler\x18\r \x01(\x0b\x32\x1f.ada_diffuser.v1.SamplerOptions\x12\x0f\n\x07refined\x18\x0e \x01(\x08\x12)\n\x07trained\x18\x0f \x01(\x0b\x32\x18.ada_diffuser.v1.Trained\x12#\n\x04told\x18\x10 \x03(\x0b\x32\x15.ada_diffuser.v1.Told\x12.\n\x07returns\x18\x11 \x01(\x0b\x32\x18.ada_diffuser.v1.ReturnsH\x00\x88\x01\x01\x12\r\n\x05guide\x18\x12 \x01(\x08\x12\x32\n\x07\x63ontext\x18\x13 \x01(\x0b\x32\x1c.ada_diffuser.v1.TrueContextH\x01\x88\x01\x01\x42\n\n\x08_returnsB\n\n\x08_context\"@\n\x04Told\x12\'\n\x04kind\x18\x01 \x01(\x0e\x32\x19.ada_diffuser.v1.ToldKind\x12\x0f\n\x07\x63olumns\x18\x02 \x03(\r\"$\n\x07Returns\x12\x0c\n\x04mean\x18\x01 \x01(\x02\x12\x0b\n\x03std\x18\x02 \x01(\x02\"G\n\x0bTrueContext\x12\x0b\n\x03\x64im\x18\x01 \x01(\r\x12+\n\x06\x66uture\x18\x02 \x01(\x0e\x32\x1b.ada_diffuser.v1.TrueFuture\"r\n\x07Trained\x12\x17\n\x0f\x61\x63tion_horizons\x18\x01 \x03(\r\x12\x11\n\tsub_steps\x18\x02 \x03(\r\x12)\n\x07missing\x18\x03 \x01(\x0b\x32\x18.ada_diffuser.v1.Missing\x12\x10\n\x08sessions\x18\x04 \x01(\x08\"8\n\x07Missing\x12\r\n\x05state\x18\x01 \x01(\x08\x12\x0e\n\x06\x61\x63tion\x18\x02 \x01(\x08\x12\x0e\n\x06reward\x18\x03 \x01(\x08\"\x18\n\x06Vector\x12\x0e\n\x06values\x18\x01 \x03(\x02\"\xf0\x05\n\x0eSamplerOptions\x12\x16\n\tstreaming\x18\x01 \x01(\x08H\x00\x88\x01\x01\x12\x1b\n\x0e\x61\x63tion_horizon\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x16\n\tsub_steps\x18\x03 \x01(\rH\x02\x88\x01\x01\x12\x10\n\x03\x65ta\x18\x04 \x01(\x02H\x03\x88\x01\x01\x12\x18\n\x0btemperature\x18\x05 \x01(\x02H\x04\x88\x01\x01\x12\x12\n\x05kappa\x18\x06 \x01(\x02H\x05\x88\x01\x01\x12\x30\n\x06latent\x18\x07 \x01(\x0e\x32\x1b.ada_diffuser.v1.LatentModeH\x06\x88\x01\x01\x12\x1b\n\x0eguidance_scale\x18\x08 \x01(\x02H\x07\x88\x01\x01\x12\x1d\n\x10guidance_samples\x18\t \x01(\rH\x08\x88\x01\x01\x12 \n\x13\x66ree_guidance_scale\x18\n \x01(\x02H\t\x88\x01\x01\x12\x18\n\x0btold_return\x18\x0b \x01(\x02H\n\x88\x01\x01\x12/\n\ttold_goal\x18\x0c \x01(\x0b\x32\x17.ada_diffuser.v1.VectorH\x0b\x88\x01\x01\x12\x17\n\ncandidates\x18\r \x01(\rH\x0c\x88\x01\x01\x12\x1d\n\x10pick_temperature\x18\x0e \x01(\x02H\r\x88\x01\x01\x12\x1a\n\rpicard_window\x18\x0f \x01(\rH\x0e\x88\x01\x01\x12\x1d\n\x10picard_tolerance\x18\x10 \x01(\x02H\x0f\x88\x01\x01\x42\x0c\n\n_streamingB\x11\n\x0f_action_horizonB\x0c\n\n_sub_stepsB\x06\n\x04_etaB\x0e\n\x0c_temperatureB\x08\n\x06_kappaB\t\n\x07_latentB\x11\n\x0f_guidance_scaleB\x13\n\x11_guidance_samplesB\x16\n\x14_free_guidance_scaleB\x0e\n\x0c_told_returnB\x0c\n\n_told_goalB\r\n\x0b_candidatesB\x13\n\x11_pick_temperatureB\x10\n\x0e_picard_windowB\x13\n\x11_picard_tolerance*O\n\x08ToldKind\x12\x19\n\x15TOLD_KIND_UNSPECIFIED\x10\x00\x12\x14\n\x10TOLD_KIND_RETURN\x10\x01\x12\x12\n\x0eTOLD_KIND_GOAL\x10\x02*V\n\nTrueFuture\x12\x1b\n\x17TRUE_FUTURE_UNSPECIFIED\x10\x00\x12\x14\n\x10TRUE_FUTURE_HELD\x10\x01\x12\x15\n\x11TRUE_FUTURE_KNOWN\x10\x02*W\n\nLatentMode\x12\x1b\n\x17LATENT_MODE_UNSPECIFIED\x10\x00\x12\x14\n\x10LATENT_MODE_MEAN\x10\x01\x12\x16\n\x12LATENT_MODE_SAMPLE\x10\x02\x32\xa5\x01\n\x06Models\x12O\n\x04List\x12\".ada_diffuser.v1.ListModelsRequest\x1a#.ada_diffuser.v1.ListModelsResponse\x12J\n\x03Get\x12 .ada_diffuser.v1.GetModelRequest\x1a!.ada_diffuser.v1.GetModelResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'ada_diffuser.v1.models_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_LATENTMODE']._serialized_start=1052
-  _globals['_LATENTMODE']._serialized_end=1139
+  _globals['_TOLDKIND']._serialized_start=1884
+  _globals['_TOLDKIND']._serialized_end=1963
+  _globals['_TRUEFUTURE']._serialized_start=1965
+  _globals['_TRUEFUTURE']._serialized_end=2051
+  _globals['_LATENTMODE']._serialized_start=2053
+  _globals['_LATENTMODE']._serialized_end=2140
   _globals['_LISTMODELSREQUEST']._serialized_start=49
   _globals['_LISTMODELSREQUEST']._serialized_end=68
   _globals['_LISTMODELSRESPONSE']._serialized_start=70
@@ -42,13 +46,21 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_GETMODELRESPONSE']._serialized_start=166
   _globals['_GETMODELRESPONSE']._serialized_end=223
   _globals['_MODEL']._serialized_start=226
-  _globals['_MODEL']._serialized_end=574
-  _globals['_TRAINED']._serialized_start=576
-  _globals['_TRAINED']._serialized_end=690
-  _globals['_MISSING']._serialized_start=692
-  _globals['_MISSING']._serialized_end=748
-  _globals['_SAMPLEROPTIONS']._serialized_start=751
-  _globals['_SAMPLEROPTIONS']._serialized_end=1050
-  _globals['_MODELS']._serialized_start=1142
-  _globals['_MODELS']._serialized_end=1307
+  _globals['_MODEL']._serialized_end=750
+  _globals['_TOLD']._serialized_start=752
+  _globals['_TOLD']._serialized_end=816
+  _globals['_RETURNS']._serialized_start=818
+  _globals['_RETURNS']._serialized_end=854
+  _globals['_TRUECONTEXT']._serialized_start=856
+  _globals['_TRUECONTEXT']._serialized_end=927
+  _globals['_TRAINED']._serialized_start=929
+  _globals['_TRAINED']._serialized_end=1043
+  _globals['_MISSING']._serialized_start=1045
+  _globals['_MISSING']._serialized_end=1101
+  _globals['_VECTOR']._serialized_start=1103
+  _globals['_VECTOR']._serialized_end=1127
+  _globals['_SAMPLEROPTIONS']._serialized_start=1130
+  _globals['_SAMPLEROPTIONS']._serialized_end=1882
+  _globals['_MODELS']._serialized_start=2143
+  _globals['_MODELS']._serialized_end=2308
 # @@protoc_insertion_point(module_scope)

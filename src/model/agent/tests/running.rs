@@ -26,7 +26,12 @@ fn step(t: usize) -> Executed {
 }
 
 fn told(steps: std::ops::Range<usize>) -> Observation {
-    Observation { state: vec![0.1 * steps.end as f32, -0.2, 0.3], executed: steps.map(step).collect(), nothing_executed: false }
+    Observation {
+        state: vec![0.1 * steps.end as f32, -0.2, 0.3],
+        executed: steps.map(step).collect(),
+        nothing_executed: false,
+        context: None,
+    }
 }
 
 /// Told in one act or step by step, the same past leaves the same memory, and no more tokens than the denoiser looks back on.

@@ -62,6 +62,11 @@ pub enum Op {
     Step(usize),
     /// All steps as the channels of one: `(batch, 1, steps channels)`.
     Flatten,
+    /// The way back: `(batch, 1, steps channels)` as so many steps.
+    Unflatten {
+        /// Of the result.
+        steps: usize,
+    },
     /// `x - other`.
     Subtract,
     /// Rows where the other, `(batch, steps, 1)`, is 1; the weight, a vector, where it is 0. The mask gets no gradient.
@@ -112,7 +117,7 @@ impl Op {
     pub fn form(&self) -> Form {
         match self {
             Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Beside | Self::Channels { .. } => Form::Anew,
-            Self::Step(_) | Self::Flatten => Form::Anew,
+            Self::Step(_) | Self::Flatten | Self::Unflatten { .. } => Form::Anew,
             Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::Subtract | Self::OrAbsent { .. } => Form::InPlace,
             Self::AddAtEachStep | Self::AddGated => Form::Sum(1),
             Self::Add => Form::Sum(2),
@@ -145,6 +150,10 @@ impl Op {
             Self::Channels { start, len } => beside(&[], start + len <= channels, [batch, steps, len]),
             Self::Step(index) => beside(&[], index < steps, [batch, 1, channels]),
             Self::Flatten => beside(&[], true, [batch, 1, steps * channels]),
+            Self::Unflatten { steps: into } => {
+                let fits = steps == 1 && into > 0 && channels.is_multiple_of(into);
+                beside(&[], fits, [batch, into, channels / into.max(1)])
+            }
             Self::Subtract => beside(&[x], true, x),
             Self::OrAbsent { width } => beside(&[[batch, steps, 1]], channels == width, x),
         };
@@ -199,7 +208,7 @@ impl Op {
             }
             Self::Channels { start, len } => join::copy_columns((x, channels, start), (out, len, 0), len),
             Self::Step(index) => join::copy_columns((x, steps * channels, index * channels), (out, channels, 0), channels),
-            Self::Flatten => out.copy_from_slice(x),
+            Self::Flatten | Self::Unflatten { .. } => out.copy_from_slice(x),
             Self::Subtract => join::subtract(out, other(1)),
             Self::OrAbsent { .. } => join::or_absent(out, other(1), weights.plain()?),
         }
@@ -246,7 +255,7 @@ impl Op {
             Self::Step(index) => {
                 fill(&mut to[0], |dx| join::copy_columns((grad, channels, 0), (dx, steps * channels, index * channels), channels));
             }
-            Self::Flatten => fill(&mut to[0], |dx| dx.copy_from_slice(grad)),
+            Self::Flatten | Self::Unflatten { .. } => fill(&mut to[0], |dx| dx.copy_from_slice(grad)),
             // The slot of `x` holds its gradient already.
             Self::Subtract => fill(&mut to[1], |dy| dy.iter_mut().zip(grad).for_each(|(dy, grad)| *dy = -grad)),
             Self::OrAbsent { .. } => {

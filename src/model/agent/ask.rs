@@ -1,0 +1,21 @@
+//! The questions of an act.
+
+/// What an act asks of the networks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ask {
+    /// The latents of its windows, from what was really seen; then they start.
+    Filter,
+    /// The latent of position 0 anew, with the noised positions 0 and 1 (zig-zag).
+    Refine,
+    /// The clean window.
+    Denoise,
+    /// The action that leads from one state of a plan to the next.
+    Invert,
+    /// What the plans are worth, to choose among them.
+    Choose,
+}
+
+impl Ask {
+    /// In this order they are answered in one tick: an act that has its latents can be denoised at once.
+    pub const ORDER: [Self; 5] = [Self::Filter, Self::Refine, Self::Denoise, Self::Invert, Self::Choose];
+}

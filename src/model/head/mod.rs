@@ -1,0 +1,4 @@
+//! From a plan to actions.
+mod inverse;
+
+pub use inverse::InverseDynamics;

@@ -1,0 +1,102 @@
+//! The error of inverse dynamics on the real steps of drawn windows, with latents as the sampler has them.
+
+use super::{
+    Job, Mean, Part,
+    denoise::{IMITATED, refine_options, window_shape},
+};
+use crate::model::{
+    Networks,
+    diffusion::{
+        inverse::InverseBatch,
+        process::Process,
+        refine::{RefineOptions, WindowBatch},
+    },
+    noise::Philox,
+};
+use crate::train::{
+    Task,
+    dataset::{
+        HELD_OUT_SEED, Sides,
+        hidden::Hide,
+        window::{Places, WindowShape, windows},
+    },
+    recipe::losses::Loss,
+};
+use anyhow::{Context, Result};
+use candle_core::{Device, Tensor};
+
+/// Held-out windows.
+const HELD_OUT_WINDOWS: usize = 256;
+
+/// Draws windows and evaluates the loss.
+pub struct InverseLoss<'a> {
+    task: &'a Task,
+    /// In the sum that the stage minimizes.
+    weight: f64,
+    shape: WindowShape,
+    episodes: Sides,
+    places: Places,
+    options: RefineOptions,
+    process: Option<Process>,
+}
+
+impl<'a> InverseLoss<'a> {
+    /// As the stage with this index has it; none where it does not.
+    pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
+        let weight = task.recipe.stages.get(stage)?.weight(Loss::Inverse);
+        let loss = task.recipe.losses.inverse.as_ref().filter(|_| weight > 0.0)?;
+        let (shape, episodes) = (window_shape(task, loss.batch), task.split.episodes.only(IMITATED));
+        let process = task.config.method.head.level_max().map(Process::cosine);
+        Some(Self { task, weight, places: shape.places(&episodes.train), shape, episodes, options: refine_options(task, false), process })
+    }
+
+    /// Draws from these episodes, which are the task's own and may tell more.
+    pub(super) fn look_at(&mut self, episodes: &Sides) {
+        self.episodes = episodes.only(IMITATED);
+    }
+
+    /// Draws the batch of a step.
+    ///
+    /// # Errors
+    /// If an episode cannot be read.
+    pub(super) fn job<'b>(&'b self, networks: &'b Networks, rng: &mut Philox) -> Result<Job<'b>> {
+        let batch = windows(&self.episodes.train, &self.places, &self.shape, None, rng)?;
+        let drawn = self.draw(self.shape.batch, rng)?;
+        Ok(Box::new(move || {
+            let loss = self.loss(networks, &batch, drawn)?;
+            let means = vec![Mean { name: "inverse", sum: f64::from(loss.to_scalar::<f32>()?), count: 1 }];
+            Ok(Part { grads: loss.affine(self.weight, 0.0)?.backward()?, means })
+        }))
+    }
+
+    /// Error on held-out windows.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn held_out(&self, networks: &Networks) -> Result<f64> {
+        let shape = WindowShape { batch: HELD_OUT_WINDOWS, hide: Hide::NOTHING, ..self.shape.clone() };
+        let (episodes, mut rng) = (&self.episodes.held_out, Philox::new(HELD_OUT_SEED));
+        let batch = windows(episodes, &shape.places(episodes), &shape, None, &mut rng)?;
+        let drawn = self.draw(shape.batch, &mut rng)?;
+        Ok(f64::from(self.loss(networks, &batch, drawn)?.to_scalar::<f32>()?))
+    }
+
+    /// Levels and noise of the actions of so many windows, of a diffusion.
+    fn draw(&self, windows: usize, rng: &mut Philox) -> Result<(Vec<usize>, Option<Tensor>)> {
+        let Some(process) = &self.process else { return Ok((Vec::new(), None)) };
+        let (steps, width) = (self.shape.horizon - 1, self.task.config.layout.action_dim);
+        let count = windows * steps;
+        let levels = (0..count).map(|_| 1 + rng.below(process.level_max())).collect();
+        let noise: Vec<f32> = (0..count * width).map(|_| rng.normal()).collect();
+        Ok((levels, Some(Tensor::from_vec(noise, (windows, steps, width), &Device::Cpu)?)))
+    }
+
+    fn loss(&self, networks: &Networks, batch: &WindowBatch, (levels, noise): (Vec<usize>, Option<Tensor>)) -> Result<Tensor> {
+        let inverse = networks.inverse.as_ref().context("a model without inverse dynamics has no error of them: is a bug")?;
+        let latents = match inverse.sees_latent() {
+            true => networks.latents_of(&self.task.config.method.plan, batch, &self.options)?,
+            false => None,
+        };
+        Ok(inverse.loss(self.process.as_ref(), &InverseBatch { batch, latents, levels, noise })?)
+    }
+}
