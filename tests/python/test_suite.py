@@ -127,7 +127,7 @@ def test_stopped_in_the_middle_it_goes_on_and_finds_the_same(done: Place, tmp_pa
     place = Place(tmp_path / "place")
     command = place.command("run", "tiny.toml", "--programs", str(BINARY.parent), "--jobs", "1")
     with subprocess.Popen(command, cwd=place.folder, stderr=subprocess.DEVNULL) as running:
-        _until(lambda: list(place.folder.glob("runs/suite/trainings/point-wind-s-recipe-*/training/state.safetensors")))
+        _until(lambda: list(place.folder.glob(f"runs/suite/trainings/point-wind-s-recipe-{'?' * 16}-seed0/training/state.safetensors")))
         started = descendants(running.pid)
         assert len(started) >= 2, "a worker and a trainer"
         running.send_signal(number)
@@ -149,8 +149,9 @@ def test_a_killed_program_fails_its_cell_alone(tmp_path: Path) -> None:
     with subprocess.Popen(
         place.command("run", "tiny.toml", "--programs", str(BINARY.parent)), cwd=place.folder, stderr=subprocess.PIPE, text=True
     ) as running:
-        _until(lambda: list(place.folder.glob("runs/suite/trainings/point-wind-s-recipe-*/training/state.safetensors")))
-        trainers = [pid for pid in descendants(running.pid) if "recipe.toml" in Path(f"/proc/{pid}/cmdline").read_text()]
+        _until(lambda: list(place.folder.glob(f"runs/suite/trainings/point-wind-s-recipe-{'?' * 16}-seed0/training/state.safetensors")))
+        commands = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in descendants(running.pid)}
+        trainers = [pid for pid, command in commands.items() if "recipe.toml" in command and "--with" not in command]
         assert trainers
         os.kill(trainers[-1], signal.SIGKILL)
         _, told = running.communicate(timeout=120)
@@ -212,7 +213,7 @@ def refused(folder: Path, text: str, capsys: pytest.CaptureFixture[str]) -> str:
         ("collect = { episodes = 24 }", "collect = { episodos = 24 }", "environments.point-wind-s.collect: ada-collect: unrecognized"),
         ("collect = { episodes = 24 }", "collect = { out = 'x' }", "environments.point-wind-s.collect.out is said by the suite itself"),
         ("collect = { episodes = 24 }", "data = 'x.h5'", "environments.point-wind-s.data: there is no x.h5; say how it is made"),
-        ("[methods.ours]\nrecipe", "[methods.ours]\nreceipt", "methods.ours.recipe is missing"),
+        ("[methods.ours]\nrecipe", "[methods.ours]\nreceipt", "methods.ours.receipt is no key here; there are recipe, with"),
         ("models/{environment}/recipe.toml", "models/nowhere.toml", "methods.ours.recipe: models/nowhere.toml"),
         ("models/methods/diffuser.toml", "models/methods/none.toml", "methods.diffuser.with: models/methods/none.toml"),
         ('\nrecipe = "models/point-wind-s/recipe.toml"', "", "methods.diffuser.recipe must be given: no environment has one of its own"),
@@ -334,7 +335,7 @@ def test_the_readme_has_an_example_of_every_key(tmp_path: Path) -> None:
     (example,) = re.findall(r"^```toml\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     (tmp_path / "example.toml").write_text(example, encoding="utf-8")
     suite = Suite.load(tmp_path / "example.toml")
-    assert len(suite.methods) == 2 + 5 and len(cells(suite)) == 3 * (2 + 2 + 5)
+    assert len(suite.methods) == 3 + 5 and len(cells(suite)) == 3 * (2 + 2 + 1 + 5)
     for key in (
         "title",
         "seeds",
