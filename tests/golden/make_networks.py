@@ -130,6 +130,69 @@ class Dit(nn.Module):
         return self.out(self.norm(x) * (1 + scale) + shift)
 
 
+class DitOfTokens(Dit):
+    """The same with the real steps as clean tokens in front of the window."""
+
+    def __init__(self, d_in: int, d_out: int, width: int, depth: int, heads: int) -> None:
+        super().__init__(d_in, d_out, width, depth, heads)
+        self.past = nn.ModuleDict({name: nn.Linear(STATE + ACTION, width) for name in ("inp", "context")})
+
+    def forward(self, x: Tensor, levels: Tensor, told: Tensor | None, steps: Tensor) -> Tensor:
+        levels = torch.cat([torch.zeros(steps.shape[:2]), levels], 1)
+        c = self.time(sinusoid(levels, self.EMB)) + torch.cat([self.past["context"](steps), self.context(x)], 1)
+        c = c if told is None else c + told[:, None]
+        h = torch.cat([self.past["inp"](steps), self.inp(x)], 1) + sinusoid(torch.arange(levels.shape[1]), self.EMB)
+        for block in self.blocks:
+            h = block(h, c)
+        c, h = c[:, steps.shape[1] :], h[:, steps.shape[1] :]
+        shift, scale = self.ada(functional.silu(c)).chunk(2, -1)
+        return self.out(self.norm(h) * (1 + scale) + shift)
+
+
+class ToldDenoiser(nn.Module):
+    """A transformer over window, latents and level embedding that is told what is wanted, and the real steps as tokens."""
+
+    def __init__(self, latent: int, told: int) -> None:
+        super().__init__()
+        d_out = STATE + ACTION
+        d_in = d_out + latent + Denoiser.LEVEL
+        self.backbone, self.input_skip = DitOfTokens(d_in, d_out, 12, 2, 3), nn.Linear(d_in, d_out)
+        self.told = nn.Sequential(nn.Linear(told + 1, 128), nn.SiLU(), nn.Linear(128, 12))
+
+    def forward(self, given: Tensors) -> Tensors:
+        x = torch.cat([given["x"], given["latents"], sinusoid(given["levels"], Denoiser.LEVEL)], -1)
+        steps = given["observed"].unflatten(2, (-1, STATE + ACTION))[:, 0]
+        return {"x0": self.backbone(x, given["levels"], self.told(given["told"][:, 0]), steps) + self.input_skip(x)}
+
+
+class Inverse(nn.Sequential):
+    """Inverse dynamics of Decision Diffuser: the action between two states, side by side, given the latent of the step."""
+
+    def __init__(self, latent: int, width: int) -> None:
+        d_in = 2 * STATE + latent
+        super().__init__(nn.Linear(d_in, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, ACTION))
+
+    def forward(self, given: Tensors) -> Tensors:
+        return {"action": super().forward(torch.cat([given["state"], given["latents"]], -1))}
+
+
+class NoisyInverse(nn.Module):
+    """The same as a diffusion of the action (DVInvMlp of CleanDiffuser), without a latent."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.time = nn.Sequential(nn.Linear(64, 128), nn.Mish(), nn.Linear(128, 64))
+        sizes = [ACTION + 64 + 2 * STATE, width, width, width, ACTION]
+        for i in range(4):
+            self.add_module(str(2 * i), nn.Linear(sizes[i], sizes[i + 1]))
+
+    def forward(self, given: Tensors) -> Tensors:
+        h = torch.cat([given["noise"], self.time(sinusoid(given["levels"], 64)), given["state"]], -1)
+        for i in range(3):
+            h = functional.mish(self.get_submodule(str(2 * i))(h))
+        return {"action": self.get_submodule("6")(h)}
+
+
 class Denoiser(nn.Module):
     """A backbone over window, latents and level embedding, with the linear skip and the embedding of the real steps."""
 
@@ -353,6 +416,18 @@ def later_cases() -> dict[str, tuple[nn.Module, Tensors]]:
     }
 
 
+def last_cases() -> dict[str, tuple[nn.Module, Tensors]]:
+    """And once those are."""
+    return {
+        "dit_told": (ToldDenoiser(4, 2), window(3, 7, 4, 3) | {"told": torch.randn(3, 1, 3)}),
+        "inverse": (Inverse(4, 7), {"state": torch.randn(3, 5, 2 * STATE), "latents": torch.randn(3, 5, 4)}),
+        "noisy_inverse": (
+            NoisyInverse(7),
+            {"state": torch.randn(3, 5, 2 * STATE), "noise": torch.randn(3, 5, ACTION), "levels": torch.randint(1, 11, (3, 5))},
+        ),
+    }
+
+
 def our_name(name: str) -> str:
     """The name of a PyTorch parameter in a checkpoint."""
     name = name.removeprefix("backbone.")
@@ -368,7 +443,7 @@ def run(network: nn.Module, given: Tensors) -> Tensors:
             parameter *= next((factor for part, factor in SPREAD.items() if part in name), 1.0)
             parameter.copy_(parameter.half())
     given = {name: value.half().double() for name, value in given.items()}
-    varied = [name for name in given if name in {"x", "latents", "observed", "state", "action", "reward", "noise", "eps"}]
+    varied = [name for name in given if name in {"x", "latents", "observed", "state", "action", "reward", "noise", "eps", "told"}]
     for name in varied:
         given[name].requires_grad_()
     results = network(given)
@@ -435,8 +510,9 @@ def save(path: Path, cases: dict[str, tuple[nn.Module, Tensors]], beside: Tensor
 def main() -> None:
     torch.manual_seed(0)
     torch.set_default_dtype(torch.float64)
-    first = results(cases())
-    save(Path(__file__).with_name("networks.safetensors"), later_cases(), process() | first)
+    done = results(cases())
+    done |= results(later_cases())
+    save(Path(__file__).with_name("networks.safetensors"), last_cases(), process() | done)
 
 
 if __name__ == "__main__":

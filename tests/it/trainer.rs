@@ -203,7 +203,7 @@ fn mistakes_get_one_clear_line() {
         (trainer, run(&["--set", "losses.denoise.bacth=3"]), "unknown field `bacth`"),
         (trainer, run(&["--data", "tests/golden/data_nan.h5"]), "NaN at row 30"),
         (trainer, run(&["--data", "nowhere.h5"]), "nowhere.h5"),
-        (trainer, run(&["--set", "model.plan.level_max=3"]), "sub_steps * horizon <= level_max"),
+        (trainer, run(&["--set", "model.plan.level_max=3"]), "sub_steps * positions <= level_max"),
         (trainer, run(&["--set", "name=\"a b\""]), "`name`"),
         (trainer, vec!["run", "nowhere.toml"], "nowhere.toml"),
         (trainer, vec!["inspect", to], "manifest.json"),

@@ -4,7 +4,7 @@ use super::*;
 use crate::model::{
     config::ModelConfig,
     golden::Golden,
-    method::{GruLatent, Looks},
+    method::{GruLatent, Looks, Told},
     nn::{Buffer, Precision, kernels::testing::with_each_isa, testing::gaussian},
     noise::Philox,
     trajectory::Layout,
@@ -158,6 +158,24 @@ proptest! {
             }
         }
     }
+}
+
+/// A transformer with real steps as tokens, that is told what is wanted.
+#[test]
+fn tokens_and_wishes_against_pytorch() {
+    let (golden, mut config) = (Golden::of("dit_told"), config(with_tokens(12, 2, 3)));
+    config.method.told = vec![Told::Goal { columns: vec![0, 1] }];
+    let levels = golden.flat("in.levels");
+    golden.check_training(|given, params| {
+        let [latents, observed, told] = ["latents", "observed", "told"].map(|name| given.get(name));
+        let condition = Given { levels: &levels, latents, observed, told };
+        Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &config.method, params)?.predict(&given["x"], &condition)?)])
+    });
+    let [x, latents, observed, told]: [Buffer; 4] = ["x", "latents", "observed", "told"].map(|name| golden.value(&format!("in.{name}")));
+    golden.check_serving(|params| {
+        let condition = Given { levels: &levels, latents: Some(&latents), observed: Some(&observed), told: Some(&told) };
+        Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &config.method, params)?.predict(&x, &condition)?)])
+    });
 }
 
 /// Real steps that are tokens are attended to, each at its own place; a window without any is refused, in a recipe and in a forward.

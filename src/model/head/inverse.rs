@@ -112,3 +112,42 @@ impl Denoiser {
         last.forward(&h)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{
+        config::ModelConfig,
+        golden::Golden,
+        method::{Backbone, Diffused, GruLatent, Looks},
+        nn::Buffer,
+    };
+
+    fn method(network: Inverse, latent: bool) -> Method {
+        let layout = Layout { state_dim: 3, action_dim: 2 };
+        let gru = latent.then(|| GruLatent::plain(4, 8, Looks::Block(2)));
+        let mut method = ModelConfig::plain(layout, gru, Backbone::dit(4, 1, 1)).method;
+        (method.plan.diffused, method.head) = (Diffused::State, Head::Inverse { network, latent });
+        method
+    }
+
+    /// Both kinds, given a latent and none: results and all gradients, as PyTorch computes them.
+    #[test]
+    fn inverse_dynamics_against_pytorch() {
+        let layout = Layout { state_dim: 3, action_dim: 2 };
+        let build = |method: &Method, params: &Params| InverseDynamics::new(layout, method, params).map(Option::unwrap);
+        let (golden, mlp) = (Golden::of("inverse"), method(Inverse::Mlp { width: 7 }, true));
+        golden.check_training(|given, params| {
+            Ok(vec![("action".into(), build(&mlp, params)?.predict(&given["state"], given.get("latents"), None)?)])
+        });
+        let [states, latents]: [Buffer; 2] = ["in.state", "in.latents"].map(|name| golden.value(name));
+        golden.check_serving(|params| Ok(vec![("action".into(), build(&mlp, params)?.predict(&states, Some(&latents), None)?)]));
+        let (golden, noisy) = (Golden::of("noisy_inverse"), method(Inverse::Diffusion { width: 7, steps: 10 }, false));
+        let levels = golden.flat("in.levels");
+        golden.check_training(|given, params| {
+            Ok(vec![("action".into(), build(&noisy, params)?.predict(&given["state"], None, Some((&given["noise"], &levels)))?)])
+        });
+        let [states, noise]: [Buffer; 2] = ["in.state", "in.noise"].map(|name| golden.value(name));
+        golden.check_serving(|params| Ok(vec![("action".into(), build(&noisy, params)?.predict(&states, None, Some((&noise, &levels)))?)]));
+    }
+}
