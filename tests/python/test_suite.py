@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
@@ -126,7 +127,9 @@ def test_stopped_in_the_middle_it_goes_on_and_finds_the_same(done: Place, tmp_pa
     """While `ours` is being trained: everything it started ends with it, and the same command finishes what it had begun."""
     place = Place(tmp_path / "place")
     command = place.command("run", "tiny.toml", "--programs", str(BINARY.parent), "--jobs", "1")
-    with subprocess.Popen(command, cwd=place.folder, stderr=subprocess.DEVNULL) as running:
+    # A shell has what it runs in the background ignore Ctrl-C, and these tests with it.
+    heard = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, cwd=place.folder, stderr=subprocess.DEVNULL, preexec_fn=heard) as running:
         _until(lambda: list(place.folder.glob(f"runs/suite/trainings/point-wind-s-recipe-{'?' * 16}-seed0/training/state.safetensors")))
         started = descendants(running.pid)
         assert len(started) >= 2, "a worker and a trainer"
