@@ -147,15 +147,6 @@ def test_what_a_client_must_know(client: Client) -> None:
         client.summary(session.session_id)
 
 
-def test_rows_at_once_are_told_apart_from_forwards(client: Client) -> None:
-    with client.open_session(seed=5, options=SamplerOptions(streaming=False)) as session:
-        one_by_one = session.act(STATES[0])
-    with client.open_session(seed=5, options=SamplerOptions(streaming=False, picard_window=4)) as session:
-        at_once = session.act(STATES[0])
-    assert one_by_one.passes == one_by_one.evaluations == 8 and at_once.passes <= 8 < at_once.evaluations
-    assert at_once.value is None and at_once.value_spread is None
-
-
 @pytest.mark.parametrize("face", FACES)
 def test_an_answer_lost_on_the_way_comes_again(address: str, face: str) -> None:
     """The connection ends when the server has acted and answers: the retry gets that answer, replayed."""

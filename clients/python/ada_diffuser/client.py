@@ -27,16 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ada_diffuser.errors import AdaError, InvalidInput, NotFound, TooLarge, Unavailable
 from ada_diffuser.faces import Face, connect
-from ada_diffuser.messages import (
-    ActCall,
-    Chunk,
-    Executed,
-    Model,
-    Observation,
-    SamplerOptions,
-    SessionSummary,
-    executed_values,
-)
+from ada_diffuser.messages import ActCall, Chunk, Executed, Model, Observation, SamplerOptions, SessionSummary, executed_values
 from ada_diffuser.retry import Backoff, RetryPolicy
 from ada_diffuser.values import column, flag, invalid, matrix, text, vector, whole
 

@@ -146,7 +146,7 @@ pub struct EngineConfig {
     /// An act that would wait for longer is refused (QUEUE_FULL), but for a slow model's, which may wait for twice as long as it takes. A queue that
     /// is longer than its clients are patient answers nobody in time.
     pub wait_ms_max: u64,
-    /// Rows of one network evaluation of a worker; an act is one.
+    /// Rows of one network evaluation of a worker. An act has one, or several; one of more than this has an evaluation for itself.
     pub batch_len_max: usize,
     /// Whether an act with `deadline_ms` takes larger jumps, or gives out the current window, when it would come too late
     /// otherwise; its answer is marked `degraded`.

@@ -225,8 +225,9 @@ impl<T: Ticket> Group<T> {
     /// Tells acts in a hurry how many evaluations they have time for; one that has time for none gives out what it has.
     fn hurry(&mut self, slowness: &mut Slowness, pace: Pace) {
         let Some(costs) = &self.costs else { return };
+        let load = Load::of(&self.acts, pace.rows_max);
         for i in (0..self.riders.len()).rev() {
-            let batch = (costs.as_ref(), Load::of(&self.acts, pace.rows_max), slowness.get());
+            let batch = (costs.as_ref(), load, slowness.get());
             match self.riders[i].hurry(&self.agent, &mut self.acts[i], batch, pace) {
                 Ok(Hurry::Cut) => slowness.forget(),
                 Ok(Hurry::Goes) => {}
