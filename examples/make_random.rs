@@ -2,6 +2,7 @@
 //!
 //!     cargo run --release --example make_random -- --out out/models/wide --widths 32,64,128,256
 //!     cargo run --release --example make_random -- --out out/models/dit --net dit --width 256 --depth 2 --heads 8
+//!     cargo run --release --example make_random -- --out out/models/led --guide-widths 32,64 --told-return
 
 #[path = "shared/random_weights.rs"]
 mod random_weights;
@@ -9,8 +10,8 @@ mod random_weights;
 use ada_diffuser::model::{
     checkpoint,
     config::{Defaults, ModelConfig, Restart},
-    method::Backbone,
-    method::{GruLatent, Looks},
+    method::{Backbone, GruLatent, Guide, Looks, Told},
+    normalizer::Affine,
     options::SamplerOptions,
     trajectory::Layout,
 };
@@ -62,6 +63,12 @@ struct Flags {
     /// Number of diffusion levels (K).
     #[arg(long, default_value_t = 150)]
     level_max: usize,
+    /// Channels of each depth of a value network, so that sessions may ask for guidance and for candidates; without it there is none.
+    #[arg(long, value_delimiter = ',', value_name = "N,N,..")]
+    guide_widths: Option<Vec<usize>>,
+    /// Whether sessions may tell a return.
+    #[arg(long)]
+    told_return: bool,
     /// Seed of the weights.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -86,6 +93,9 @@ impl Flags {
         let layout = Layout { state_dim: self.state_dim, action_dim: self.action_dim };
         let mut config = ModelConfig::plain(layout, latent, backbone);
         (config.method.plan.horizon, config.method.plan.level_max) = (self.plan_horizon, self.level_max);
+        config.method.guide = self.guide_widths.clone().map(|widths| Guide::Value { widths });
+        config.method.told = self.told_return.then_some(Told::Return).into_iter().collect();
+        config.units.returns = config.method.asks_for_returns().then(|| Affine::identity(1));
         config.defaults = Defaults {
             sampler: SamplerOptions { temperature: 0.0, ..SamplerOptions::default() },
             // Finite, since JSON has no infinity, and out of reach.

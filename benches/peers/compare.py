@@ -5,7 +5,8 @@
     PEERS_VENV=/path/to/venv make bench-peers           # with a virtual environment that has the requirements already
 
 Each figure is the median over turns; theirs and ours take turns (A B A B ...), so that a slow minute of the machine hits both.
-PyTorch counts with the best of its modes (eager, jit, compile). Prints one Markdown table. Nothing else should run on the machine.
+PyTorch counts with the best of its modes (eager, jit, compile). An act of the group `act` is asked of our server over the wire, and of
+PyTorch as a function. Prints one Markdown table. Nothing else should run on the machine.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ SERVER = RELEASE / "ada-server"
 LOAD = RELEASE / "examples/load"
 MAKE_RANDOM = RELEASE / "examples/make_random"
 TIME_DENOISERS = RELEASE / "examples/time_denoisers"
+TIME_ACTS = RELEASE / "examples/time_acts"
 
 # One program never takes longer than this, in seconds.
 PATIENCE = 900.0
@@ -104,13 +105,13 @@ class Ours:
 
 
 @contextmanager
-def ada_server(models: Path) -> Iterator[Ours]:
+def ada_server(models: Path, default: str = "narrow") -> Iterator[Ours]:
     """A fresh server over these models, with room for many sessions."""
     if not SERVER.exists():
         raise NotMeasured(f"{_short(str(SERVER))} is not there")
     port = free_port()
     settings = ["sessions.len_max=20000", "telemetry.log=warn"]
-    words = [str(SERVER), "--listen", f"127.0.0.1:{port}", "--models", str(models), "--default-model", "narrow"]
+    words = [str(SERVER), "--listen", f"127.0.0.1:{port}", "--models", str(models), "--default-model", default]
     for setting in settings:
         words += ["--set", setting]
     with _running(words, f"http://127.0.0.1:{port}/readyz") as process:

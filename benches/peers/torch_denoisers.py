@@ -55,27 +55,38 @@ class ResBlock(nn.Module):
         return self.second(h) + self.skip(x)
 
 
+def way_down(d_in: int, widths: Sequence[int], emb: int) -> nn.ModuleList:
+    """Two blocks a depth, then every other step, but for the deepest."""
+    down = nn.ModuleList()
+    for j, (a, b) in enumerate(pairwise([d_in, *widths])):
+        halve = nn.Identity() if j == len(widths) - 1 else nn.Conv1d(b, b, 3, 2, 1)
+        down.append(nn.ModuleList([ResBlock(a, b, emb), ResBlock(b, b, emb), halve]))
+    return down
+
+
+def time_embedding(emb: int) -> nn.Sequential:
+    """Of a level's sinusoid."""
+    return nn.Sequential(nn.Linear(emb, 4 * emb), nn.Mish(), nn.Linear(4 * emb, emb))
+
+
 class TemporalUNet(nn.Module):
     """(B, T, d_in) -> (B, T, d_out); widths e.g. 32,64,64,64 (the paper's text) or 32,64,128,256 (the reference code's reading)."""
 
     def __init__(self, d_in: int, d_out: int, widths: Sequence[int], emb: int = 32) -> None:
         super().__init__()
         self.emb = emb
-        self.time = nn.Sequential(nn.Linear(emb, 4 * emb), nn.Mish(), nn.Linear(4 * emb, emb))
+        self.time, self.down, self.up = time_embedding(emb), way_down(d_in, widths, emb), nn.ModuleList()
         dims = [d_in, *widths]
-        pairs = list(pairwise(dims))
-        self.down, self.up = nn.ModuleList(), nn.ModuleList()
-        for j, (a, b) in enumerate(pairs):
-            last = j == len(pairs) - 1
-            halve = nn.Identity() if last else nn.Conv1d(b, b, 3, 2, 1)
-            self.down.append(nn.ModuleList([ResBlock(a, b, emb), ResBlock(b, b, emb), halve]))
         self.mid1, self.mid2 = ResBlock(dims[-1], dims[-1], emb), ResBlock(dims[-1], dims[-1], emb)
-        for a, b in reversed(pairs[1:]):
+        for a, b in reversed(list(pairwise(widths))):
             self.up.append(nn.ModuleList([ResBlock(2 * b, a, emb), ResBlock(a, a, emb), nn.ConvTranspose1d(a, a, 4, 2, 1)]))
         self.final1, self.final2 = ConvBlock(dims[1], dims[1]), nn.Conv1d(dims[1], d_out, 1)
 
     def forward(self, x: Tensor, levels: Tensor) -> Tensor:
-        e = self.time(sinusoid(levels.float().mean(1), self.emb))
+        return self.run(x, self.time(sinusoid(levels.float().mean(1), self.emb)))
+
+    def run(self, x: Tensor, e: Tensor) -> Tensor:
+        """With the embedding of the mean level."""
         x, skips = x.transpose(1, 2), []
         for r1, r2, down in self.down:
             x = r2(r1(x, e), e)

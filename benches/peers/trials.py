@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-from processes import TIME_DENOISERS, NotMeasured, ada_server, peer, python_server, run
+from processes import MAKE_RANDOM, TIME_ACTS, TIME_DENOISERS, NotMeasured, ada_server, peer, python_server, run
 
 # Figures of one turn: by mode (eager, jit, ...), then by name.
 Figures = dict[str, dict[str, float]]
@@ -19,7 +21,9 @@ NARROW, WIDE = "32,64,64,64", "32,64,128,256"
 CLIENTS, IDLE, CHURN = 32, 10_000, 1_000
 # An episode of HalfCheetah's planner as tokens of a transformer.
 DIT_LEN = 42
-GROUPS = ("forward", "train", "serve", "memory", "churn")
+GROUPS = ("forward", "train", "serve", "act", "memory", "churn")
+# Actions of two programs that do the same, of 16 evaluations in f32, normalized.
+ALIKE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class Trial:
 
 def trials() -> list[Trial]:
     """All of them, in the order of the table."""
-    return [*_forward(), *_train(), *_serve(), _memory(), _churn()]
+    return [*_forward(), *_train(), *_serve(), *_act(), _memory(), _churn()]
 
 
 @dataclass(frozen=True)
@@ -175,6 +179,69 @@ def _serve() -> Iterator[Trial]:
     rate = Goal(f"{streaming}, {CLIENTS} clients", "acts/s", "acts/s", "times more", 10)
     tail = Goal(f"{streaming}, {CLIENTS} clients, p99", "p99", "ms", "times faster", 10)
     yield Trial("serve", f"{streaming}, {CLIENTS} clients", (rate, tail), _against_python(1, CLIENTS))
+
+
+@dataclass(frozen=True)
+class Act:
+    """A cold act of one session, sampled as neither `serve` nor `forward` is."""
+
+    text: str
+    # Of its checkpoint, beside those of the narrow U-Net without latents.
+    flags: tuple[str, ...]
+    # Of its session, and of their function.
+    options: tuple[str, ...]
+    evaluations: int
+
+
+VALUE = ("--guide-widths", "32,64")
+ACTS = (
+    Act("guided act, 16 evaluations, a value gradient in each", VALUE, ("guidance_scale=1.5",), 16),
+    Act("free-guided act, 16 evaluations of 2 rows", ("--told-return",), ("told_return=1", "free_guidance_scale=1.2"), 32),
+    Act("act of 64 candidates, 16 evaluations of 64 rows", VALUE, ("candidates=64",), 1024),
+)
+
+
+def _act() -> Iterator[Trial]:
+    for act in ACTS:
+        goal = Goal(f"{act.text}, 1 client, p50", "p50", "ms", "times faster", 8)
+        yield Trial("act", goal.text, (goal,), lambda s, stack, act=act: _against_a_function(act, s, stack))
+
+
+def _against_a_function(act: Act, settings: Settings, stack: ExitStack) -> tuple[Side, Side]:
+    """Our server, asked by one client over the wire, against a function of PyTorch in the process that times it, on the same weights. What
+    our act takes without a server around it (`alone`) stands beside, and what both act on without noise must be the same.
+    """
+    models = Path(stack.enter_context(TemporaryDirectory()))
+    run(MAKE_RANDOM, "--out", models / "acting", "--widths", NARROW, "--latent-dim", 0, *act.flags)
+    server = stack.enter_context(ada_server(models, "acting"))
+    options = [word for option in (*act.options, "temperature=0.5") for word in ("--set", option)]
+    common = ("--model", models / "acting", *options, "--seconds", settings.seconds)
+    theirs: list[dict[str, Any]] = []
+
+    def ask_theirs() -> Figures:
+        theirs[:] = [line for line in peer("torch_acts.py", *common, "--modes", settings.modes) if "ms" in line]
+        return {str(line["mode"]): {"p50": float(line["ms"])} for line in theirs}
+
+    def ask_ours() -> Figures:
+        ours = run(TIME_ACTS, *common)[0]
+        for line in theirs:
+            if not _alike(line, ours):
+                raise NotMeasured(f"PyTorch ({line['mode']}) acts otherwise: {line['action']}, not {ours['action']}")
+        client = ("--clients", 1, "--seconds", settings.seconds, "--face", settings.face)
+        report = server.load(*client, *options, "--set", "streaming=false")
+        if abs(report["evaluations_per_act"] - act.evaluations) > 0.01:
+            raise NotMeasured(f"our act took {report['evaluations_per_act']:.2f} evaluations, not {act.evaluations}")
+        return {settings.face: {**_figures(report), "alone": float(ours["ms"])}}
+
+    return ask_theirs, ask_ours
+
+
+def _alike(theirs: dict[str, Any], ours: dict[str, Any]) -> bool:
+    """Whether the actions are the same, and the values where both tell one."""
+    pairs = list(zip(theirs["action"], ours["action"], strict=True))
+    if theirs["value"] is not None and ours["value"] is not None:
+        pairs.append((theirs["value"], ours["value"]))
+    return all(math.isclose(a, b, rel_tol=ALIKE, abs_tol=ALIKE) for a, b in pairs)
 
 
 def _memory() -> Trial:
