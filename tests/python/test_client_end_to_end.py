@@ -385,6 +385,11 @@ def test_the_commands_leave_what_they_promise(address: str, tmp_path: Path, caps
     for picture in ("png", "gif"):
         with Image.open(names[picture]) as opened:
             assert min(opened.size) > 100
+    assert rollout_command.main([*words, "--json", str(names["json"]), "--model", "tiny", "--beside", "tiny"]) == 0
+    first, beside = json.loads(names["json"].read_text())
+    assert first["returns"] == beside["returns"] and "+0.00 ± 0.00" in capsys.readouterr().out
+    assert rollout_command.main([*words, "--beside", "tiny", "nobody"]) == 1
+    assert "nobody" in capsys.readouterr().err, "before the first episode"
 
     words = ["--env", "point-wind-s", "--url", address, "--models", "tiny", "--episodes", "2", "--seed", "3", "--markdown"]
     grid = [*words, "--set", "streaming=true,false", "--set", "temperature=0,1", "--json", str(names["json"])]

@@ -92,7 +92,7 @@ def test_a_picture_that_fails_loses_nothing(
         raise RuntimeError("the font is gone")
 
     monkeypatch.setattr(plot, "save_plot", broken)
-    monkeypatch.setattr(film, "save_film", lambda env, episode, readout, path, env_options: path.write_text("film") and None)
+    monkeypatch.setattr(film, "save_film", lambda panels, path: path.write_text("film") and None)
     words = quick(address, "--model", "tiny", "--json", "out/a.json", "--plot", "out/a.png", "--film", "out/a.gif")
     assert rollout.main(words) == 1
     told = capsys.readouterr()

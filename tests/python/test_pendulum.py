@@ -12,7 +12,7 @@ from PIL import Image
 from ada_diffuser import environments
 from ada_diffuser.environments import PendulumGravityE
 from ada_diffuser.rollout import Episode
-from ada_diffuser.rollout.film import save_film
+from ada_diffuser.rollout.film import Panel, save_film
 
 
 def test_it_follows_its_equations():
@@ -117,6 +117,6 @@ def test_it_draws_the_rod_the_gravity_and_the_torque():
 def test_its_film_shows_every_step(tmp_path):
     actions = [np.full(1, 2.0, np.float32)] * 10
     episode = Episode(3, actions=actions, rewards=[-1.0] * 10, contexts=[np.full(1, 9.0, np.float32)] * 10)
-    assert save_film("pendulum-gravity-e", episode, "none", tmp_path / "film.gif") is None
+    assert save_film([Panel("pendulum-gravity-e", episode)], tmp_path / "film.gif") is None
     with Image.open(tmp_path / "film.gif") as film:
         assert film.n_frames == 10

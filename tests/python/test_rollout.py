@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from ada_diffuser import SamplerOptions, environments
 from ada_diffuser.commands import evaluate as evaluate_command
@@ -17,9 +17,9 @@ from ada_diffuser.commands import parse_settings, server_url
 from ada_diffuser.commands import rollout as rollout_command
 from ada_diffuser.messages import Missing, Model, Timings, Trained
 from ada_diffuser.rollout import ActLog, Episode, Evaluation, Trial
-from ada_diffuser.rollout.film import save_film
+from ada_diffuser.rollout.film import Panel, save_film
 from ada_diffuser.rollout.plot import save_plot
-from ada_diffuser.rollout.readout import Readout, fit
+from ada_diffuser.rollout.readout import Reading, Readout, fit, read
 from ada_diffuser.rollout.report import markdown, table
 from ada_diffuser.rollout.seeds import by_recipe
 
@@ -52,6 +52,12 @@ def finished(env_name: str, episodes: list[Episode]) -> Evaluation:
     trained = Trained((1,), (1,), Missing(state=False, action=False, reward=False))
     model = Model("fake", "ab" * 32, True, 1, 1, 8, 4, 1, 2, 10, -box, box, options, True, trained)
     return Evaluation(Trial(env_name, episodes=len(episodes)), model, options, episodes, acts, 1.0)
+
+
+def named(name: str, env_name: str, episodes: list[Episode]) -> Reading:
+    """Of a model with this name."""
+    result = finished(env_name, episodes)
+    return read(replace(result, model=replace(result.model, name=name)))
 
 
 def test_statistics() -> None:
@@ -95,9 +101,10 @@ def test_a_readout_that_cannot_be_says_why() -> None:
 
 def test_the_table_and_the_markdown_hold_the_numbers() -> None:
     result = finished("point-wind-s", [Episode(0, rewards=[-1.0]), Episode(1, rewards=[-3.0])])
-    text = table(result, "no readout, because")
+    text = table([Reading(result, "no readout, because", None)])
     for words in ("-2.00 ± 1.00", "0 of 2", "p50 2.00 ms, p99 2.98 ms", "4.50", "no readout, because", "kappa=inf"):
         assert words in text
+    assert "above the first" not in text
     rows = markdown([result], ["kappa", "streaming"]).splitlines()
     assert len(rows) == 3 and len({row.count("|") for row in rows}) == 1
     assert rows[2].startswith("| point-wind-s | fake | inf | true | -2.00 ± 1.00 | -2.00 | 0/2 | 4.50 |")
@@ -137,9 +144,9 @@ def test_other_settings_are_other_groups() -> None:
 @pytest.mark.parametrize("env", ["cheetah-wind-s", "point-wind-s"])
 def test_the_picture_is_drawn_and_the_same_each_time(tmp_path: Path, env: str) -> None:
     episodes = [played(env, seed) for seed in range(3)]
-    result, read = finished(env, episodes), fit(episodes)
+    reading = Reading(finished(env, episodes), fit(episodes), None)
     for name in ("a.png", "b.png"):
-        save_plot(result, read, tmp_path / name)
+        save_plot([reading], tmp_path / name)
     with Image.open(tmp_path / "a.png") as picture:
         assert min(picture.size) > 500 and len(set(picture.convert("L").tobytes())) > 10
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
@@ -147,24 +154,52 @@ def test_the_picture_is_drawn_and_the_same_each_time(tmp_path: Path, env: str) -
 
 def test_the_point_film_has_a_frame_a_step(tmp_path: Path) -> None:
     episodes = [played("point-wind-s", seed) for seed in range(2)]
-    assert save_film("point-wind-s", episodes[1], fit(episodes), tmp_path / "film.gif") is None
+    assert save_film([Panel("point-wind-s", episodes[1], fit(episodes))], tmp_path / "film.gif") is None
     with Image.open(tmp_path / "film.gif") as film:
         assert film.n_frames == 20 and film.info["loop"] == 0
 
 
+def test_models_on_the_same_episodes_stand_side_by_side(tmp_path: Path) -> None:
+    """In the table with the difference, episode by episode; in the plot; in the film, where one whose episode is over waits."""
+    knowing = named("knowing", "point-wind-s", [played("point-wind-s", seed) for seed in range(4)])
+    blind = [played("point-wind-s", seed, steps=12) for seed in range(4)]
+    for place, (episode, other) in enumerate(zip(blind, knowing.result.episodes, strict=True)):
+        episode.latents = [np.zeros(0, np.float32)] * 12
+        episode.rewards = [0.0] * 11 + [other.total - (1.0 if place % 2 else 3.0)]
+    both = [knowing, named("blind", "point-wind-s", blind)]
+    rows = [line.split("  ") for line in table(both).splitlines()]
+    cells = {row[0].strip(): [cell.strip() for cell in row[1:] if cell.strip()] for row in rows}
+    assert cells["above the first"] == ["-2.00 ± 0.58"] and cells["model"] == ["knowing@abababababab", "blind@abababababab"]
+    assert list(cells).index("above the first") == list(cells).index("median return") + 1
+    assert cells["context readout"][1] == "this model has no latent to read out" and cells["context readout"][0].startswith("R²")
+
+    for name, shown in (("both", both), ("turned", both[::-1]), ("one", both[:1])):
+        save_plot(shown, tmp_path / f"{name}.png")
+    assert len({(tmp_path / f"{name}.png").read_bytes() for name in ("both", "turned", "one")}) == 3
+
+    panels = [Panel.last(one, one.result.model.name) for one in both]
+    assert save_film(panels, tmp_path / "both.gif") is None and save_film([Panel.last(knowing)], tmp_path / "one.gif") is None
+    with Image.open(tmp_path / "both.gif") as film, Image.open(tmp_path / "one.gif") as one:
+        assert film.n_frames == 20 and film.width == 2 * one.width and film.height > one.height, "a line more, with the names"
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+    moved = [np.abs(frame.astype(int) - frames[11]).mean(axis=(0, 2)) for frame in frames]  # by column; each frame has a palette of its own
+    left, right = np.array(moved)[:, : one.width].mean(axis=1), np.array(moved)[:, one.width :].mean(axis=1)
+    assert left[-1] > 10 * right[-1] and right[0] > 10 * right[-1]
+
+
 def test_a_film_shows_the_environment_with_its_options(tmp_path: Path) -> None:
     episode = played("point-wind-s", 1)
-    for name, options in (("plain", None), ("same", {"omega": 0.2}), ("other", {"omega": 2.0})):
-        assert save_film("point-wind-s", episode, "none", tmp_path / name, options) is None
+    for name, options in (("plain", {}), ("same", {"omega": 0.2}), ("other", {"omega": 2.0})):
+        assert save_film([Panel("point-wind-s", episode, env_options=options)], tmp_path / name) is None
     plain, same, other = ((tmp_path / name).read_bytes() for name in ("plain", "same", "other"))
     assert plain == same != other
-    assert "omegas" in str(save_film("point-wind-s", episode, "none", tmp_path / "none", {"omegas": 1}))
+    assert "omegas" in str(save_film([Panel("point-wind-s", episode, env_options={"omegas": 1})], tmp_path / "none"))
 
 
 @pytest.mark.parametrize("env", ["cheetah-wind-s", "cheetah-dir-e", "ant-dir-e"])
 def test_the_film_of_a_body_is_made_or_its_absence_explained(tmp_path: Path, env: str) -> None:
     path = tmp_path / "film.gif"
-    reason = save_film(env, played(env, 3), "none", path)
+    reason = save_film([Panel(env, played(env, 3))], path)
     if reason is None:
         with Image.open(path) as film:
             assert film.n_frames == 20
@@ -174,7 +209,7 @@ def test_the_film_of_a_body_is_made_or_its_absence_explained(tmp_path: Path, env
 
 def test_a_renderer_that_does_not_exist_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(os.environ, "MUJOCO_GL", "crayons")
-    reason = save_film("cheetah-wind-s", played("cheetah-wind-s", 3, steps=2), "none", tmp_path / "film.gif")
+    reason = save_film([Panel("cheetah-wind-s", played("cheetah-wind-s", 3, steps=2))], tmp_path / "film.gif")
     assert reason is not None and "crayons" in reason
 
 

@@ -120,6 +120,11 @@ def test_status_tells_what_is_missing(done: Place, tmp_path: Path, monkeypatch: 
     assert main(["status", "tiny.toml", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [one["missing"] for one in told["cells"]] == [[], [], ["cold", "streaming"], ["cold"]] and told["seconds_left"] > 0
+    assert main(["status", "tiny.toml", "--only", "*/diffuser/seed1", "*/seed1"]) == 0
+    told = capsys.readouterr().out
+    assert told.index("diffuser/seed1") < told.index("ours/seed1") and "seed0" not in told, "in the order of the patterns, each once"
+    assert main(["status", "tiny.toml", "--only", "*/seed1", "gale/*"]) == 1
+    assert "--only gale/*: there is no such cell" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])

@@ -20,7 +20,7 @@ from ada_diffuser.experts import formula_of, recipe_for
 from ada_diffuser.experts.policy import LinearPolicy
 from ada_diffuser.experts.training import ExpertRecipe, _Course
 from ada_diffuser.rollout import Episode
-from ada_diffuser.rollout.film import save_film
+from ada_diffuser.rollout.film import Panel, save_film
 
 MINE = '''
 import numpy as np
@@ -153,7 +153,7 @@ def test_the_film_is_what_the_class_draws(mine):
     env = environments.make("mine:formula")
     env.reset(seed=1)
     episode = Episode(1, actions=[np.zeros(1, np.float32)] * 4, rewards=[0.0] * 4, contexts=[np.ones(1, np.float32)] * 4)
-    assert save_film("mine:mine/Formula-v0", episode, "none", mine / "film.gif") is None
+    assert save_film([Panel("mine:mine/Formula-v0", episode)], mine / "film.gif") is None
     with Image.open(mine / "film.gif") as film:
         assert film.n_frames > 0 and film.convert("RGB").getpixel((5, 5)) == (7, 7, 7)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,11 +25,11 @@ from ada_diffuser.commands.progress import progress
 from ada_diffuser.options import SamplerOptions
 
 if TYPE_CHECKING:
-    from ada_diffuser.rollout import Evaluation
-    from ada_diffuser.rollout.readout import Readout
+    from ada_diffuser.rollout.readout import Reading
 
 _ABOUT = """\
-Drives an environment with a model on a running ada-server and prints what it earned and what it cost.
+Drives an environment with a model on a running ada-server and prints what it earned and what it cost. --beside has other models
+play the same episodes: a column of the table, a colour of the plot and a panel of the film for each.
 Folders of --json, --plot and --film are made before the first episode, and one that fails does not keep back the others.
 Episode e runs with seed SEED + e, in the environment and in the model, so the same command gives the same returns and all
 models see the same episodes. Failed is what the environment's class calls failed (clients/python/README.md lists it)."""
@@ -46,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     add_server_arguments(parser)
     add_trial_arguments(parser)
     parser.add_argument("--model", default="", help="name or name@digest (default: the server's default model)")
+    parser.add_argument("--beside", nargs="+", default=[], metavar="MODEL", help="other models, on the same episodes")
     parser.add_argument("--episodes", type=int, default=10, help="episodes to run (default 10)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--vector", type=int, default=1, metavar="N", help="step N environments in lockstep by ActBatch")
@@ -54,7 +56,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--film", type=Path, metavar="GIF", help="film of the last episode")
     parser.add_argument("--plot", type=Path, metavar="PNG", help="rewards, returns, true and read-out context")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="the numbers of the table and each episode's return")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="the numbers of the table and each episode's return; with --beside a list of them"
+    )
     parser.add_argument("--no-table", dest="table", action="store_false", help="print no table")
     return parser
 
@@ -66,10 +70,10 @@ def _run(arguments: argparse.Namespace) -> None:
     check_output("--film", arguments.film, ".gif")
     check_environment(arguments)
     from ada_diffuser.rollout import Trial, check, evaluate
-    from ada_diffuser.rollout.readout import fit
+    from ada_diffuser.rollout.readout import read
     from ada_diffuser.rollout.report import table
 
-    trial = Trial(
+    first = Trial(
         arguments.env,
         arguments.model,
         arguments.episodes,
@@ -80,32 +84,33 @@ def _run(arguments: argparse.Namespace) -> None:
         withhold_rewards=arguments.withhold_rewards,
         env_options=environment_options(arguments.env_option),
     )
+    trials = [first, *(replace(first, model=model) for model in arguments.beside)]
     with Client(server_url(arguments.url, arguments.face)) as client:
         client.wait_ready(arguments.wait)
-        steps = trial.episodes * check(client, trial)
-        with progress(steps, trial.env, "step") as advance:
-            result = evaluate(client, trial, advance)
-    readout = fit(result.episodes)
+        steps = sum(trial.episodes * check(client, trial) for trial in trials)
+        with progress(steps, first.env, "step") as advance:
+            readings = [read(evaluate(client, trial, advance)) for trial in trials]
     if arguments.table:
-        print(table(result, readout), flush=True)
-    _write_all(arguments, result, readout)
+        print(table(readings), flush=True)
+    _write_all(arguments, readings)
 
 
-def _write_all(arguments: argparse.Namespace, result: Evaluation, readout: Readout | str) -> None:
+def _write_all(arguments: argparse.Namespace, readings: Sequence[Reading]) -> None:
     """Every file that was asked for, whatever becomes of the others. Raises `ValueError` naming those that failed."""
-    from ada_diffuser.rollout.film import save_film
+    from ada_diffuser.rollout.film import Panel, save_film
     from ada_diffuser.rollout.plot import save_plot
 
     def save_film_or_say_why(path: Path) -> None:
-        reason = save_film(result.trial.env, result.episodes[-1], readout, path, result.trial.env_options)
+        reason = save_film([Panel.last(one, one.result.model.name if arguments.beside else "") for one in readings], path)
         print(f"film: {path}" if reason is None else f"film: skipped, no way to render here ({reason})")
 
     def save_plot_and_say_so(path: Path) -> None:
-        save_plot(result, readout, path)
+        save_plot(readings, path)
         print(f"plot: {path}")
 
+    numbers = [one.result.as_json() for one in readings]
     wanted: list[tuple[str, Path | None, Callable[[Path], None]]] = [
-        ("--json", arguments.json, lambda path: save_json(result.as_json(), path)),
+        ("--json", arguments.json, lambda path: save_json(numbers if arguments.beside else numbers[0], path)),
         ("--plot", arguments.plot, save_plot_and_say_so),
         ("--film", arguments.film, save_film_or_say_why),
     ]

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ Cells = methods x environments x training seeds, as a file says. Each cell colle
 streaming, and probes; what it found goes to report/cells/SUITE/ENVIRONMENT/METHOD/seedN-MODE.json.
 
   ada-suite run report/suites/planners.toml      # stop it at any time; the same command goes on
+  ada-suite run report/suites/planners.toml --only 'cheetah-vel-e/*' 'point-wind-s/*/seed0'
   ada-suite status report/suites/planners.toml
   ada-suite report                                          # report/README.md and its pictures, from the finished cells
 
@@ -39,6 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     run = _command(commands, "run", _run, "do what is not done yet")
     _add_work(run)
+    _add_only(run)
     run.add_argument("--jobs", type=int, default=2, metavar="N", help="cells at a time, each on one core (default 2)")
     run.add_argument("--json", action="store_true", help="print what became of the cells as JSON")
     one = _command(commands, "cell", _cell, "do one cell, here and now, to see what it says")
@@ -46,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_work(one)
     one.add_argument("--jobs", type=int, default=1, metavar="N", help="cells that share the machine meanwhile: its file says so")
     status = _command(commands, "status", _status, "which cells are done, and how long the others will take")
+    _add_only(status)
     status.add_argument("--jobs", type=int, default=2, metavar="N", help="cells at a time (default 2)")
     status.add_argument("--json", action="store_true", help="print it as JSON")
     report = commands.add_parser("report", help="write tables and pictures of finished cells")
@@ -67,6 +71,25 @@ def _command(commands: Any, name: str, run: Any, about: str) -> argparse.Argumen
     return parser
 
 
+def _add_only(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--only", nargs="+", metavar="CELL", help="of all cells these, in this order: ENVIRONMENT/METHOD/seedN, * is anything; in quotes"
+    )
+
+
+def _chosen(cells: Sequence[Cell], patterns: Sequence[str] | None) -> list[Cell]:
+    """Those that a pattern fits, pattern by pattern; ValueError where one fits none."""
+    if patterns is None:
+        return list(cells)
+    chosen: dict[str, Cell] = {}
+    for pattern in patterns:
+        fitting = {cell.name: cell for cell in cells if fnmatchcase(cell.name, pattern)}
+        if not fitting:
+            raise ValueError(f"--only {pattern}: there is no such cell; `ada-suite status` names them")
+        chosen |= fitting
+    return list(chosen.values())
+
+
 def _add_work(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--programs", type=Path, metavar="DIR", help="where ada-server and ada-trainer are (default: PATH, target/release)")
 
@@ -77,7 +100,8 @@ def _load(arguments: argparse.Namespace) -> tuple[list[Cell], Places]:
 
     if getattr(arguments, "jobs", 1) < 1:
         raise ValueError("--jobs must be at least 1")
-    return cells(Suite.load(arguments.suite)), Places(arguments.cells, arguments.runs, arguments.data)
+    all_cells = cells(Suite.load(arguments.suite))
+    return _chosen(all_cells, getattr(arguments, "only", None)), Places(arguments.cells, arguments.runs, arguments.data)
 
 
 def _run(arguments: argparse.Namespace) -> None:

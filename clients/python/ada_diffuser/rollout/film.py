@@ -1,7 +1,7 @@
-"""A short film of one episode, as a GIF: the recorded actions played again in an environment that can render.
+"""A short film of one episode, as a GIF: the recorded actions played again in an environment that can render; models side by side.
 
 Rendering runs in a process of its own, because MuJoCo reads `MUJOCO_GL` when it is imported and a machine without a screen
-may have EGL, OSMesa or neither: `python -m ada_diffuser.rollout.film EPISODE.npz FILM.gif`.
+may have EGL, OSMesa or neither: `python -m ada_diffuser.rollout.film FILM.gif EPISODE.npz ...`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,31 +21,57 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ada_diffuser import environments
-from ada_diffuser.rollout.readout import Readout
+from ada_diffuser.rollout.readout import Reading, Readout
 from ada_diffuser.rollout.result import Episode
 
 #: A film larger than this is thinned out and shrunk until it fits.
 BYTES_MAX = 6_000_000
 WIDTH = 360
+CAPTION = 18
 FRAME_MS = 50
 
 
-def save_film(env: str, episode: Episode, readout: Readout | str, path: Path, env_options: Mapping[str, Any] | None = None) -> str | None:
-    """Writes the film; None, or why there is none. `env_options` are those of the environment that the episode was played in."""
-    with tempfile.TemporaryDirectory() as folder:
-        recorded = Path(folder) / "episode.npz"
-        seen = readout.of(episode) if isinstance(readout, Readout) else np.zeros((0, 0))
+@dataclass(frozen=True)
+class Panel:
+    """An episode, and what is written about it."""
+
+    env: str
+    episode: Episode
+    readout: Readout | str = ""
+    #: Above it; nothing is.
+    title: str = ""
+    #: Those of the environment that it was played in.
+    env_options: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def last(cls, reading: Reading, title: str = "") -> Panel:
+        """The last episode of an evaluation."""
+        trial = reading.result.trial
+        return cls(trial.env, reading.result.episodes[-1], reading.readout, title, trial.env_options)
+
+    def save(self, file: Path) -> None:
+        """All that the renderer needs."""
+        episode = self.episode
         np.savez(
-            recorded,
-            env=env,
-            env_options=json.dumps(dict(env_options or {})),
+            file,
+            title=self.title,
+            env=self.env,
+            env_options=json.dumps(dict(self.env_options)),
             seed=episode.seed,
             actions=np.array(episode.actions),
             rewards=np.array(episode.rewards),
             contexts=np.array(episode.contexts),
             act_steps=np.array(episode.act_steps),
-            seen=seen,
+            seen=self.readout.of(episode) if isinstance(self.readout, Readout) else np.zeros((0, 0)),
         )
+
+
+def save_film(panels: Sequence[Panel], path: Path) -> str | None:
+    """Writes the film of these, side by side; None, or why there is none."""
+    with tempfile.TemporaryDirectory() as folder:
+        recorded = [Path(folder) / f"{place}.npz" for place in range(len(panels))]
+        for panel, file in zip(panels, recorded, strict=True):
+            panel.save(file)
         reasons = []
         for backend in _backends():
             reason = _render_apart(recorded, path, backend)
@@ -59,8 +86,8 @@ def _backends() -> list[str]:
     return [chosen] if chosen else ["egl", "osmesa"]
 
 
-def _render_apart(recorded: Path, path: Path, backend: str) -> str | None:
-    command = [sys.executable, "-m", __name__, str(recorded), str(path)]
+def _render_apart(recorded: Sequence[Path], path: Path, backend: str) -> str | None:
+    command = [sys.executable, "-m", __name__, str(path), *map(str, recorded)]
     environment = {**os.environ, "MUJOCO_GL": backend}
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
@@ -94,10 +121,29 @@ def _captioned(frame: Image.Image, record: dict[str, NDArray[np.float32]], step:
     if record["seen"].size:
         act = int(np.searchsorted(record["act_steps"], step, side="right")) - 1
         words.append("read out " + " ".join(f"{value:.1f}" for value in record["seen"][act]))
-    taller = Image.new("RGB", (frame.width, frame.height + 18), "black")
-    taller.paste(frame)
-    ImageDraw.Draw(taller).text((6, frame.height + 3), "  |  ".join(words), fill="white")
+    title = str(record["title"])
+    above = CAPTION if title else 0
+    taller = Image.new("RGB", (frame.width, above + frame.height + CAPTION), "black")
+    taller.paste(frame, (0, above))
+    draw = ImageDraw.Draw(taller)
+    draw.text((6, 3), title, fill="white")
+    draw.text((6, above + frame.height + 3), "  |  ".join(words), fill="white")
     return taller
+
+
+def _beside(panels: Sequence[Iterator[Image.Image]]) -> Iterator[Image.Image]:
+    """Frames of several films as one; whose episode is over stands still while the others go on."""
+    last: list[Image.Image] = []
+    while fresh := [next(panel, None) for panel in panels]:
+        if not any(fresh):
+            return
+        last = [new or old for new, old in zip(fresh, last or fresh, strict=True) if new or old]
+        wide = Image.new("RGB", (sum(one.width for one in last), max(one.height for one in last)), "black")
+        left = 0
+        for one in last:
+            wide.paste(one, (left, 0))
+            left += one.width
+        yield wide
 
 
 def _write(frames: list[Image.Image], path: Path) -> None:
@@ -111,12 +157,15 @@ def _write(frames: list[Image.Image], path: Path) -> None:
 
 
 def main() -> int:
-    """Renders one recorded episode; the last line on stderr says what is wrong."""
-    recorded, path = Path(sys.argv[1]), Path(sys.argv[2])
-    with np.load(recorded) as stored:
-        record = {name: stored[name] for name in stored.files}
-    _write(list(_frames(record)), path)
+    """Renders recorded episodes; the last line on stderr says what is wrong."""
+    path, *recorded = map(Path, sys.argv[1:])
+    _write(list(_beside([_frames(_read(file)) for file in recorded])), path)
     return 0
+
+
+def _read(file: Path) -> dict[str, NDArray[Any]]:
+    with np.load(file) as stored:
+        return {name: stored[name] for name in stored.files}
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,19 +18,33 @@ EPISODES_SHOWN = 3
 STEPS_SHOWN = 80
 #: Latents in a picture, every so many-th of them.
 LATENTS_SHOWN = 2000
+#: Of a model, and of its episodes that failed.
+COLOURS = (("C0", "C9"), ("C3", "C1"), ("C2", "C8"), ("C4", "C6"))
 
 
-def save_plot(result: Evaluation, readout: Readout | str, path: Path) -> None:
-    """Writes the picture in the format that the suffix names (png, pdf, svg)."""
+def save_plot(readings: Sequence[Reading], path: Path) -> None:
+    """Writes the picture of models on the same episodes, in the format that the suffix names (png, pdf, svg)."""
     figure, (rewards, returns, context) = pyplot().subplots(3, 1, figsize=(9, 9), height_ratios=(2, 2, 3), layout="constrained")
-    figure.suptitle(
-        f"{result.model.name} on {result.trial.env}: "
-        f"return {result.mean_return:.1f} ± {result.standard_error:.1f} over {len(result.episodes)} episodes"
-    )
-    _draw_rewards(rewards, result)
-    _draw_returns(returns, result)
-    _draw_context(context, result, readout)
+    figure.suptitle("\n".join(_title(one.result) for one in readings))
+    for one, (colour, lost) in zip(readings, itertools.cycle(COLOURS)):
+        _draw_rewards(rewards, one.result, colour)
+        _draw_returns(returns, one.result, colour, lost)
+    rewards.set(xlabel="step", ylabel="reward")
+    rewards.legend(loc="lower right", fontsize=8, title="mean, and 10 to 90 %", title_fontsize=8)
+    returns.set(xlabel="step", ylabel="return so far")
+    returns.legend(loc="lower left", fontsize=8)
+    _draw_context(context, _knows(readings))
     save(figure, path)
+
+
+def _title(result: Evaluation) -> str:
+    mean = f"return {result.mean_return:.1f} ± {result.standard_error:.1f}"
+    return f"{result.model.name} on {result.trial.env}: {mean} over {len(result.episodes)} episodes"
+
+
+def _knows(readings: Sequence[Reading]) -> Reading:
+    """The first of them whose latent tells something; the first of all where none does."""
+    return next((one for one in readings if isinstance(one.readout, Readout)), readings[0])
 
 
 def save_latents(readings: Sequence[Reading], path: Path) -> None:
@@ -72,25 +87,24 @@ def save(figure: Any, path: Path) -> None:
     pyplot().close(figure)
 
 
-def _draw_rewards(axes: Any, result: Evaluation) -> None:
+def _draw_rewards(axes: Any, result: Evaluation, colour: str) -> None:
     rewards = _padded([episode.rewards for episode in result.episodes])
     steps = np.arange(rewards.shape[1])
-    axes.plot(steps, np.nanmean(rewards, axis=0), color="C0", label="mean")
-    axes.fill_between(steps, *np.nanpercentile(rewards, (10, 90), axis=0), color="C0", alpha=0.2, label="10 to 90 %")
-    axes.set(xlabel="step", ylabel="reward")
-    axes.legend(loc="lower right")
+    axes.plot(steps, np.nanmean(rewards, axis=0), color=colour, label=result.model.name)
+    axes.fill_between(steps, *np.nanpercentile(rewards, (10, 90), axis=0), color=colour, alpha=0.2)
 
 
-def _draw_returns(axes: Any, result: Evaluation) -> None:
+def _draw_returns(axes: Any, result: Evaluation, colour: str, lost: str) -> None:
+    """Each episode, those that the environment calls failed in a colour of their own, and their mean."""
     for episode in result.episodes:
-        axes.plot(np.cumsum(episode.rewards), color="C3" if episode.failed else "C0", alpha=0.4, linewidth=0.8)
+        axes.plot(np.cumsum(episode.rewards), color=lost if episode.failed else colour, alpha=0.35, linewidth=0.8)
     mean = np.nanmean(_padded([np.cumsum(episode.rewards).tolist() for episode in result.episodes]), axis=0)
-    axes.plot(mean, color="black", label="mean")
-    axes.set(xlabel="step", ylabel="return so far")
-    axes.legend(loc="lower left")
+    axes.plot(mean, color="black", linewidth=3)
+    axes.plot(mean, color=colour, label=result.model.name)
 
 
-def _draw_context(axes: Any, result: Evaluation, readout: Readout | str) -> None:
+def _draw_context(axes: Any, reading: Reading) -> None:
+    result, readout = reading.result, reading.readout
     read = readout if isinstance(readout, Readout) else None
     first = read.first_shown if read else 0
     offset = 0
@@ -99,7 +113,9 @@ def _draw_context(axes: Any, result: Evaluation, readout: Readout | str) -> None
         offset += min(STEPS_SHOWN, len(episode.rewards))
         axes.axvline(offset, color="0.8", linewidth=0.8)
     axes.set(xlabel=f"step, the first {STEPS_SHOWN} of each episode", ylabel="hidden context")
-    title = f"true context, and read out of the latent (R² = {read.r2:.3f} on episodes not fitted)" if read else readout
+    title = (
+        f"true context, and read out of the latent of {result.model.name} (R² = {read.r2:.3f} on episodes not fitted)" if read else readout
+    )
     axes.set_title(title, fontsize=10)
     if axes.get_legend_handles_labels()[1]:
         axes.legend(loc="upper left", bbox_to_anchor=(1, 1))

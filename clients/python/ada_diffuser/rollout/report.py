@@ -7,15 +7,28 @@ from statistics import fmean
 
 from ada_diffuser.rollout.choice import Choice, Tried
 from ada_diffuser.rollout.readout import Place, Reading, Readout
-from ada_diffuser.rollout.result import Evaluation
+from ada_diffuser.rollout.result import Evaluation, mean_and_error
 from ada_diffuser.rollout.seeds import SeedGroup, by_recipe
 
+#: Where differences stand in the table.
+_AFTER_MEDIAN = 6
 
-def table(result: Evaluation, readout: Readout | str) -> str:
-    """What the demo ends with."""
+
+def table(readings: Sequence[Reading]) -> str:
+    """What the demo ends with: a column for each model, all on the same episodes."""
+    rows = [(cells[0][0], *(value for _, value in cells)) for cells in zip(*map(_column, readings), strict=True)]
+    if len(readings) > 1:
+        first = readings[0].result
+        rows.insert(_AFTER_MEDIAN, ("above the first", "", *(_difference(one.result, first) for one in readings[1:])))
+    widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def _column(reading: Reading) -> list[tuple[str, str]]:
+    result, readout = reading.result, reading.readout
     options = ", ".join(f"{name}={_setting(value)}" for name, value in result.options.given().items())
     call = "batch" if result.trial.vector > 1 else "act"
-    rows = [
+    return [
         ("environment", result.trial.env),
         ("model", f"{result.model.name}@{result.model.digest[:12]}"),
         ("options", options),
@@ -30,8 +43,12 @@ def table(result: Evaluation, readout: Readout | str) -> str:
         ("context readout", f"R² {readout.r2:.3f}" if isinstance(readout, Readout) else readout),
         ("time", f"{result.wall_s:.1f} s"),
     ]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+
+
+def _difference(result: Evaluation, other: Evaluation) -> str:
+    """Of the mean returns, with the standard error over the episodes, which are the same."""
+    mean, error = mean_and_error([result.returns[[i]] - other.returns[[i]] for i in range(len(result.returns))])
+    return f"{mean:+.2f} ± {error:.2f}"
 
 
 def outcome(result: Evaluation) -> str:
