@@ -102,6 +102,20 @@ def test_each_cell_leaves_what_was_asked_for(done: Place) -> None:
     assert not list((done.folder / "runs/suite/tiny/served").rglob("*.safetensors"))
 
 
+def test_nothing_is_probed_where_nothing_is_inferred(done: Place, tmp_path: Path) -> None:
+    """An oracle trained for minutes, and its cell failed: it has a latent, which is the truth."""
+    oracle = """
+[methods.oracle]
+with = ["models/methods/oracle.toml"]
+set = ["losses.denoise.batch=16", "stages.denoise.steps=20"]
+modes = ["cold"]
+"""
+    place = done.copy(tmp_path / "place", TINY + oracle)
+    told = place.run("--only", "*/oracle/*")
+    assert told.returncode == 0 and "(1 of 1 cells)" in told.stderr, told.stderr
+    assert place.files()["oracle/seed0-cold"]["probe"] is None
+
+
 def test_what_is_done_is_not_done_again(done: Place) -> None:
     paths = sorted(done.folder.glob("report/cells/**/*.json"))
     before = [path.stat().st_mtime_ns for path in paths], done.log("ours")

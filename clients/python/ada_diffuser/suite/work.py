@@ -136,12 +136,12 @@ def _served(cell: Cell, programs: Programs, run: Path, model: Path) -> Path:
 
 
 def _probed(programs: Programs, told: dict[str, Any], run: Path, data: Path) -> list[dict[str, Any]] | None:
-    """The error of a linear probe by what it is told and how many tokens it is shown, of all ages; None where there is nothing to probe."""
+    """The error of a linear probe by what it is told and how many tokens it is shown, of all ages; None where nothing is inferred."""
     import h5py
 
     with h5py.File(data, "r") as file:
         tells = "infos/context" in file
-    if not tells or told["config"]["method"]["latent"]["kind"] == "none":
+    if not tells or told["config"]["method"]["latent"]["kind"] != "gru":
         return None
     _say("probes")
     kept = ("evidence", "block_len", "mse", "ceiling")
