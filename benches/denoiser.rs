@@ -108,6 +108,29 @@ fn act(c: &mut Criterion) {
     }
 }
 
+/// What latents cost over the same network without them, and the zig-zag over latents alone.
+fn overhead(c: &mut Criterion) {
+    let latent = LatentSource::Gru(GruLatent::plain(8, 64, Looks::Block(10)));
+    for (name, net) in nets() {
+        for (what, latent, kappa) in
+            [("without", LatentSource::None, 0.0), ("latents", latent.clone(), 0.0), ("latents-and-zigzag", latent.clone(), 0.1)]
+        {
+            let mut config = config(net.clone());
+            (config.method.latent, config.trained.refined) = (latent, kappa > 0.0);
+            config.defaults.sampler.kappa = kappa;
+            let agent = Agent::new(config.clone(), frozen(&config), "bench".into());
+            for (kind, streaming) in [("streaming", true), ("cold", false)] {
+                let options = SamplerOptions { streaming, ..config.defaults.sampler.clone() };
+                let observation = Observation { state: vec![0.1; STATE], ..Observation::default() };
+                let (episode, _) = agent.act(&agent.open(1, &options).expect("opens"), &observation).expect("acts");
+                c.bench_function(&format!("act/overhead/{name}/{kind}/{what}"), |b| {
+                    b.iter(|| black_box(agent.act(&episode, &observation).expect("acts")))
+                });
+            }
+        }
+    }
+}
+
 /// What a latent costs an act that streams: a block looked at anew, a GRU that runs on, and the same beside a baseline, without and with a look
 /// at actions.
 fn latents(c: &mut Criterion) {
@@ -159,5 +182,5 @@ fn train_step(c: &mut Criterion) {
     }
 }
 
-criterion_group! { name = all; config = Criterion::default().sample_size(20).warm_up_time(std::time::Duration::from_millis(500)).measurement_time(std::time::Duration::from_secs(2)); targets = forward, value, act, latents, train_step }
+criterion_group! { name = all; config = Criterion::default().sample_size(20).warm_up_time(std::time::Duration::from_millis(500)).measurement_time(std::time::Duration::from_secs(2)); targets = forward, value, act, overhead, latents, train_step }
 criterion_main!(all);

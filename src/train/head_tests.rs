@@ -10,7 +10,7 @@ use super::{
 use crate::model::{agent::Observation, checkpoint, options::SamplerOptions};
 use std::fs;
 
-const OTHERS: [&str; 9] = [
+pub(super) const OTHERS: [&str; 9] = [
     "model.plan.diffused=state",
     "model.head={kind = \"inverse\", network = {kind = \"diffusion\", width = 8, steps = 4}, latent = true}",
     "model.guide={kind = \"value\", widths = [8]}",

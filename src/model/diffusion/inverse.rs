@@ -11,11 +11,13 @@ use candle_core::{Device, Result, Tensor};
 pub struct InverseBatch<'a> {
     /// `(B, T, state_dim + action_dim)` clean windows.
     pub batch: &'a WindowBatch,
+    /// N: the steps of a window from its first on, up to T - 1.
+    pub steps: usize,
     /// `(B, T, dim)` latents as the sampler has them, of inverse dynamics that see them.
     pub latents: Option<Tensor>,
-    /// Levels of the actions, `B * (T - 1)`, 1 ..= level_max; of a diffusion.
+    /// Levels of the actions, `B * N`, 1 ..= level_max; of a diffusion.
     pub levels: Vec<usize>,
-    /// `(B, T - 1, action_dim)` Gaussian draws; of a diffusion.
+    /// `(B, N, action_dim)` Gaussian draws; of a diffusion.
     pub noise: Option<Tensor>,
 }
 
@@ -59,17 +61,17 @@ impl InverseDynamics {
     /// If a shape differs from the configuration.
     pub fn loss(&self, process: Option<&Process>, given: &InverseBatch) -> Result<Tensor> {
         let (window, columns) = (&given.batch.window, given.batch.columns()?);
-        let (count, len, _) = window.dims3()?;
+        let (count, steps) = (window.dim(0)?, given.steps);
         let part = |columns: &std::ops::Range<usize>, first: usize| {
-            window.narrow(1, first, len - 1)?.narrow(2, columns.start, columns.len())?.contiguous()
+            window.narrow(1, first, steps)?.narrow(2, columns.start, columns.len())?.contiguous()
         };
         let states = Tensor::cat(&[part(&columns.state, 0)?, part(&columns.state, 1)?], 2)?;
         let (actions, latents) = (part(&columns.action, 0)?, given.latents.as_ref());
-        let latents = latents.map(|latents| latents.narrow(1, 0, len - 1)?.contiguous()).transpose()?;
+        let latents = latents.map(|latents| latents.narrow(1, 0, steps)?.contiguous()).transpose()?;
         let predicted = match (process, &given.noise) {
             (Some(process), Some(noise)) => {
                 let (signals, sigmas): (Vec<f32>, Vec<f32>) = given.levels.iter().map(|level| process.q_sample(*level)).unzip();
-                let column = |values| Tensor::from_vec(values, (count, len - 1, 1), &Device::Cpu);
+                let column = |values| Tensor::from_vec(values, (count, steps, 1), &Device::Cpu);
                 let noisy = (actions.broadcast_mul(&column(signals)?)? + noise.broadcast_mul(&column(sigmas)?)?)?;
                 let levels: Vec<f32> = given.levels.iter().map(|level| *level as f32).collect();
                 self.predict(&states, latents.as_ref(), Some((&noisy, &levels)))?

@@ -1,4 +1,8 @@
 //! The error of inverse dynamics on the real steps of drawn windows, with latents as the sampler has them.
+//!
+//! Those that see the latent learn from the first step of each window, the one that they are asked for: the latents of later ones are imagined,
+//! and trained on all of them alike the network trusted the latent of its own step as little as those of steps far ahead. On Point-Wind-S its
+//! actions were off by .12 where the planned states were off by what .07 of an action does, and of 50 episodes cold it lost 10.
 
 use super::{
     Job, Mean, Part,
@@ -11,6 +15,7 @@ use crate::model::{
         process::Process,
         refine::{RefineOptions, WindowBatch},
     },
+    method::Head,
     noise::Philox,
 };
 use crate::train::{
@@ -81,10 +86,18 @@ impl<'a> InverseLoss<'a> {
         Ok(f64::from(self.loss(networks, &batch, drawn)?.to_scalar::<f32>()?))
     }
 
+    /// Steps of a window that count: without a latent all are alike.
+    fn steps(&self) -> usize {
+        match self.task.config.method.head {
+            Head::Inverse { latent: true, .. } => 1,
+            Head::Inverse { latent: false, .. } | Head::Direct => self.shape.horizon - 1,
+        }
+    }
+
     /// Levels and noise of the actions of so many windows, of a diffusion.
     fn draw(&self, windows: usize, rng: &mut Philox) -> Result<(Vec<usize>, Option<Tensor>)> {
         let Some(process) = &self.process else { return Ok((Vec::new(), None)) };
-        let (steps, width) = (self.shape.horizon - 1, self.task.config.layout.action_dim);
+        let (steps, width) = (self.steps(), self.task.config.layout.action_dim);
         let count = windows * steps;
         let levels = (0..count).map(|_| 1 + rng.below(process.level_max())).collect();
         let noise: Vec<f32> = (0..count * width).map(|_| rng.normal()).collect();
@@ -97,6 +110,43 @@ impl<'a> InverseLoss<'a> {
             true => networks.latents_of(&self.task.config.method.plan, batch, &self.options)?,
             false => None,
         };
-        Ok(inverse.loss(self.process.as_ref(), &InverseBatch { batch, latents, levels, noise })?)
+        Ok(inverse.loss(self.process.as_ref(), &InverseBatch { batch, steps: self.steps(), latents, levels, noise })?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::train::{
+        dataset::room::Room,
+        head_tests::OTHERS,
+        tests::{recipe_with, train},
+    };
+    use candle_core::IndexOp;
+
+    /// The error of the first training batch, and the same where the states from position 2 on are others.
+    fn errors(latent: bool) -> [f32; 2] {
+        let head = format!("model.head={{kind = \"inverse\", network = {{kind = \"mlp\", width = 8}}, latent = {latent}}}");
+        let changes: Vec<&str> = OTHERS.iter().copied().filter(|key| !key.starts_with("model.head")).chain([head.as_str()]).collect();
+        let dir = tempfile::tempdir().unwrap();
+        train(&changes, dir.path(), None).unwrap();
+        let agent = crate::model::checkpoint::load(dir.path()).unwrap();
+        let task = Task::new(recipe_with(&changes).unwrap(), &Room::default()).unwrap();
+        let loss = InverseLoss::of_stage(&task, task.recipe.stages.len() - 1).unwrap();
+        let (episodes, mut rng) = (&loss.episodes.train, Philox::new(3));
+        let mut batch = windows(episodes, &loss.places, &loss.shape, None, &mut rng).unwrap();
+        let drawn = loss.draw(loss.shape.batch, &mut rng).unwrap();
+        let mut error = |batch: &WindowBatch| loss.loss(agent.networks(), batch, drawn.clone()).unwrap().to_scalar::<f32>().unwrap();
+        let before = error(&batch);
+        let (first, rest) = (batch.window.i((.., ..2)).unwrap(), batch.window.i((.., 2..)).unwrap());
+        batch.window = Tensor::cat(&[&first, &rest.affine(3.0, 1.0).unwrap()], 1).unwrap();
+        [before, error(&batch)]
+    }
+
+    /// The latents of later steps are imagined: those who are asked about the first one would learn to trust none.
+    #[test]
+    fn who_sees_the_latent_learns_from_the_step_that_is_asked_for() {
+        let ([before, after], [alike, others]) = (errors(true), errors(false));
+        assert!(before.is_finite() && before == after && alike != others, "{before} {after} {alike} {others}");
     }
 }
