@@ -152,6 +152,7 @@ def test_stopped_in_the_middle_it_goes_on_and_finds_the_same(done: Place, tmp_pa
         _until(lambda: list(place.folder.glob(f"runs/suite/trainings/point-wind-s-recipe-{'?' * 16}-seed0/training/state.safetensors")))
         started = descendants(running.pid)
         assert len(started) >= 2, "a worker and a trainer"
+        assert all(len(os.sched_getaffinity(pid)) == 1 for pid in started), "a training takes all the cores that it sees"
         running.send_signal(number)
         assert running.wait(60) == (130 if number == signal.SIGINT else -signal.SIGKILL)
     for pid in started:

@@ -48,6 +48,8 @@ class _Worker:
     cell: Cell
     log: Path
     process: subprocess.Popen[bytes]
+    #: That it, and all that it runs, is bound to.
+    core: int | None
     started: float = field(default_factory=lambda: time.monotonic())
 
     @property
@@ -71,7 +73,7 @@ def run(cells: Sequence[Cell], places: Places, jobs: int, command: Command, dura
         while waiting or workers:
             while len(workers) < jobs and (cell := next_cell(waiting, [worker.cell for worker in workers], places)):
                 waiting.remove(cell)
-                workers.append(_start(cell, places, command))
+                workers.append(_start(cell, places, command, _free_core([worker.core for worker in workers])))
             for worker in [one for one in workers if one.process.poll() is not None]:
                 workers.remove(worker)
                 board.ended(worker, _settle(worker, places, outcome), waiting, workers)
@@ -89,7 +91,13 @@ def next_cell(waiting: Sequence[Cell], at_work: Sequence[Cell], places: Places) 
     return next((cell for cell in waiting if cell.training(places) not in busy), None)
 
 
-def _start(cell: Cell, places: Places, command: Command) -> _Worker:
+def _free_core(taken: Sequence[int | None]) -> int | None:
+    """One that this process may use and no worker has: a training takes all that it sees, and two of them would wait for each other."""
+    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    return next((core for core in usable if core not in taken), None)
+
+
+def _start(cell: Cell, places: Places, command: Command, core: int | None) -> _Worker:
     log = cell.log(places)
     log.parent.mkdir(parents=True, exist_ok=True)
     # In a session of its own: Ctrl-C ends this program, which then stops its cells.
@@ -102,7 +110,9 @@ def _start(cell: Cell, places: Places, command: Command) -> _Worker:
             env={**os.environ, **_ONE_THREAD},
             start_new_session=True,
         )
-    return _Worker(cell, log, process)
+    if core is not None:
+        os.sched_setaffinity(process.pid, {core})
+    return _Worker(cell, log, process, core)
 
 
 def _settle(worker: _Worker, places: Places, outcome: Outcome) -> str | None:

@@ -116,7 +116,7 @@ def cost(results: Results) -> str:
             row += [estimate(there.each(itemgetter(name)) if there else None) for name in ("evaluations_per_act", "p50_ms")]
         rows.append(row)
     caption = (
-        f"Cost: mean over {_seeds(results)} ± standard error over them. A training's wall time is of one thread; the time of an act is "
+        f"Cost: mean over {_seeds(results)} ± standard error over them. A training's wall time is of one core; the time of an act is "
         "that of one session alone over gRPC on loopback, beside the other cells at work."
     )
     return _captioned(caption, heads, rows)
