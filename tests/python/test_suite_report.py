@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from server import ROOT
 
 from ada_diffuser.commands.suite import main
-from ada_diffuser.suite.report.results import Group
+from ada_diffuser.suite.report import tables
+from ada_diffuser.suite.report.results import Estimate, Group, Results
 from ada_diffuser.suite.report.tables import estimate
+from ada_diffuser.suite.suite import Suite
 
 GOLDEN = ROOT / "tests/golden/suite"
 
@@ -32,6 +36,36 @@ def test_standard_errors_are_over_seeds_and_over_episodes() -> None:
     assert gap.over_episodes == pytest.approx(np.std([0.5, 2.0], ddof=1) / np.sqrt(2))
     assert one.less(group(s7=[0.0, 0.0])) is None
     assert estimate(group(s0=[-10.0, -14.0]).estimate) == "-12.0 ± - ± 2.0" and estimate(None) == "-"
+
+
+def test_the_order_is_told_in_words_beside_the_papers(tmp_path: Path) -> None:
+    """What is clear, what is not, and what the paper has otherwise."""
+
+    def cells(name: str, *means: float) -> Group:
+        spread = np.array([-1.0, 0.0, 1.0])
+        return Group([{"seed": seed, "returns": list(mean + spread * (1 + 0.1 * seed)), "failures": 0} for seed, mean in enumerate(means)])
+
+    suite = replace(
+        Suite.load(GOLDEN / "golden.toml"),
+        environments={"here": None, "there": None},
+        methods={name: SimpleNamespace(name=name) for name in ("ours", "above", "level", "below", "nobody")},
+        paper={"here": {"ours": -10, "above": -12.0, "level": -20, "below": "-1 (made up)"}},
+    )
+    found = {"ours": (-10, -10.2), "above": (-5, -5.1), "level": (-9, -11.5), "below": (-30, -31)}
+    groups = {(place, name, "cold"): cells(name, *means) for name, means in found.items() for place in ("here", "there")}
+    del groups["there", "level", "cold"]
+    results = Results(suite, groups, 0, 0, 0)
+    text = tables.order(results, "cold")
+    assert text is not None and tables.order(results, "streaming") is None
+    _, here, there = text.split("\n- ")
+    assert (
+        here.startswith("here: above above (+5.1; ") and "; not told apart from level (-0.2; " in here and "; below below (-20.4; " in here
+    )
+    assert here.endswith("**The other way round in the paper: above; apart in the paper and not here: level.**")
+    assert "level" not in there and there.endswith(".") and "paper" not in there
+    gap = groups["here", "below", "cold"].less(groups["here", "ours", "cold"])
+    assert gap is not None and gap.in_errors == pytest.approx(gap.mean / np.hypot(gap.over_seeds, gap.over_episodes))
+    assert Estimate(3.0, None, 0.5).in_errors == 6.0 and Estimate(3.0, None, None).in_errors == 0.0
 
 
 def test_a_report_of_the_same_cells_is_the_same(

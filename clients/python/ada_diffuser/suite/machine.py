@@ -9,11 +9,10 @@ from typing import Any
 
 
 def machine(cells_at_once: int) -> dict[str, Any]:
-    """Model of the processor, the widest vectors that it can, cores that this process may use, and how many cells shared them."""
+    """Model of the processor, the widest vectors that it can, its cores, and how many cells shared them, one core for each."""
     model, flags = _processor(Path("/proc/cpuinfo"))
     vectors = next((name for name, flag in (("avx512", "avx512f"), ("avx2", "avx2")) if flag in flags), platform.machine())
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"cpu": model, "vectors": vectors, "cores": cores, "cells_at_once": cells_at_once}
+    return {"cpu": model, "vectors": vectors, "cores": os.cpu_count(), "cells_at_once": cells_at_once}
 
 
 def _processor(path: Path) -> tuple[str, set[str]]:

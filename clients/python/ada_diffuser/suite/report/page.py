@@ -43,7 +43,7 @@ def _section(results: Results, out: Path, written: list[Path]) -> str:
         return f"## {suite.title}\n\nSuite `{suite.name}`: nothing is finished.\n"
     parts = [f"## {suite.title}", f"Suite `{suite.name}`. {tables.scale(results)}"]
     for mode in results.modes:
-        parts += [tables.returns(results, mode), tables.differences(results, mode)]
+        parts += [tables.returns(results, mode), tables.differences(results, mode), tables.order(results, mode)]
     parts += [tables.cost(results), tables.knowledge(results)]
     for name, title, draw in _pictures(results):
         path = out / f"{suite.name}-{name}.png"

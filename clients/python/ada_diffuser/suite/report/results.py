@@ -25,6 +25,12 @@ class Estimate:
     #: Over episodes, these trainings given: what other episodes would change.
     over_episodes: float | None = None
 
+    @property
+    def in_errors(self) -> float:
+        """The mean over its standard error, both kinds pooled: the root of the sum of their squares. 0 where there is none."""
+        error = float(np.hypot(self.over_seeds or 0.0, self.over_episodes or 0.0))
+        return self.mean / error if error else 0.0
+
     @classmethod
     def of(cls, values: Sequence[float]) -> Estimate:
         """Of one number a training seed."""

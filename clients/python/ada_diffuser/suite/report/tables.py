@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from operator import itemgetter
 
 from ada_diffuser.rollout.report import rows_of
 from ada_diffuser.suite.report.results import Estimate, Group, Results, own_error, probe_error
-from ada_diffuser.suite.suite import Method, Mode
+from ada_diffuser.suite.suite import Method, Mode, Suite
 
+#: Standard errors from which on a difference is called one.
+CLEAR = 3.0
 #: What was not measured.
 NOTHING = "-"
 
@@ -100,6 +102,53 @@ def differences(results: Results, mode: Mode) -> str | None:
         f"{results.suite.episodes} episodes; ± standard error of the difference over training seeds ± over episodes."
     )
     return _captioned(caption, ["method", *results.environments], rows)
+
+
+def order(results: Results, mode: Mode) -> str | None:
+    """The same in words: who is above the reference and who below it, and where the paper has it otherwise; None as for the differences."""
+    reference = results.suite.reference
+    lines = []
+    for environment in results.environments:
+        theirs = results.group(environment, reference, mode) if reference else None
+        if theirs is None:
+            continue
+        mine = {method.name: results.group(environment, method.name, mode) for method in results.methods if method.name != reference}
+        gaps = {name: gap for name, group in mine.items() if group and (gap := group.less(theirs))}
+        told = [
+            f"{side} {', '.join(f'{name} ({gap.mean:+.1f}; {abs(gap.in_errors):.1f})' for name, gap in found.items())}"
+            for side, found in (
+                ("above", {name: gap for name, gap in gaps.items() if gap.in_errors > CLEAR}),
+                ("not told apart from", {name: gap for name, gap in gaps.items() if abs(gap.in_errors) <= CLEAR}),
+                ("below", {name: gap for name, gap in gaps.items() if gap.in_errors < -CLEAR}),
+            )
+            if found
+        ]
+        if told:
+            lines.append(f"- {environment}: {'; '.join(told)}.{_against_the_paper(results.suite, environment, gaps)}")
+    if not lines:
+        return None
+    caption = (
+        f"In words, {mode}: who is above {reference}, who cannot be told apart from it (within {CLEAR:.0f} standard errors) and who is "
+        "below; in brackets by how much, and how many standard errors of the difference that is, those over training seeds and over "
+        "episodes pooled."
+    )
+    return f"*{caption}*\n\n" + "\n".join(lines)
+
+
+def _against_the_paper(suite: Suite, environment: str, gaps: Mapping[str, Estimate]) -> str:
+    """Which of them the paper has on the other side of the reference, or on a side where here is none."""
+    paper = suite.paper.get(environment, {})
+    base = paper.get(suite.reference or "")
+    if not isinstance(base, int | float):
+        return ""
+    known = {name: float(value) - base for name in gaps if isinstance(value := paper.get(name), int | float)}
+    if not known:
+        return ""
+    other = [name for name, gap in known.items() if gaps[name].in_errors * gap < 0 and abs(gaps[name].in_errors) > CLEAR]
+    unclear = [name for name in known if abs(gaps[name].in_errors) <= CLEAR]
+    said = [f"the other way round in the paper: {', '.join(other)}"] if other else []
+    said += [f"apart in the paper and not here: {', '.join(unclear)}"] if unclear else []
+    return f" **{'; '.join(said).capitalize()}.**" if said else " As in the paper."
 
 
 def cost(results: Results) -> str:
