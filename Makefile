@@ -17,7 +17,7 @@ help: ## This list.
 tools: ## Checks that the tools are there, and says how to install what is missing.
 	@deploy/check-tools.sh $(PYTHON)
 
-demo: build venv ## Builds, serves the shipped model and lets HalfCheetah run in a wind it cannot see.
+demo: build venv ## Builds, serves the shipped models and lets HalfCheetah run in a wind it cannot see, with latents and without.
 	@DEMO_EPISODES=$(DEMO_EPISODES) deploy/demo.sh
 
 serve: build ## Serves models/ on loopback.

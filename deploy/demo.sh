@@ -1,5 +1,6 @@
 #!/bin/sh
-# Starts the server on a free port, lets the default model drive HalfCheetah in a hidden wind, and leaves a plot and a film in out/.
+# Starts the server on a free port, lets HalfCheetah run in a wind that it cannot see and that turns round, with latents and by the same
+# network without them, and leaves numbers, a plot and a film of both in out/.
 set -eu
 episodes=${DEMO_EPISODES:-32}
 python=.venv/bin/python
@@ -16,5 +17,5 @@ until $python -c "import urllib.request; urllib.request.urlopen('http://127.0.0.
     sleep 0.1
 done
 echo "server ready on 127.0.0.1:$port, log in out/server.log"
-.venv/bin/ada-rollout --env cheetah-wind-s --model cheetah-wind-s --url "grpc://127.0.0.1:$port" --episodes "$episodes" \
-    --plot out/demo.png --film out/demo.gif
+.venv/bin/ada-rollout --env cheetah-gale-s --model cheetah-gale-s --beside cheetah-gale-s-without-latents --url "grpc://127.0.0.1:$port" \
+    --episodes "$episodes" --seed 1000 --json out/demo.json --plot out/demo.png --film out/demo.gif

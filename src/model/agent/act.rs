@@ -28,6 +28,8 @@ pub struct Act {
     /// See [`Known::aligned`].
     aligned: bool,
     started: bool,
+    /// Whether the latents behind position 0 are known.
+    rolled_out: bool,
     start: Start,
     /// Belief of position 0 at the last cold start: a chain of one.
     anchor: Chain,
@@ -52,6 +54,7 @@ impl Act {
     pub(super) fn new(episode: Episode, known: Known, table: Table, config: &ModelConfig) -> Self {
         let (options, method) = (episode.options(), &config.method);
         let width = method.plan.width(config.layout.widths());
+        let latents = Chain::new(method.plan.horizon + options.action_horizon - 1, method.latent.dim());
         let sampling = |index| Sampling {
             table,
             actions: options.action_horizon,
@@ -64,7 +67,7 @@ impl Act {
         let candidate = |index| {
             Candidate::new(
                 Descent::new(sampling(index), known.state.clone(), [method.plan.horizon, width]),
-                Chain::new(method.plan.horizon + options.action_horizon - 1, method.latent.dim()),
+                latents.clone(),
                 [options.action_horizon, config.layout.action_dim],
             )
         };
@@ -72,6 +75,7 @@ impl Act {
         Self {
             aligned: *aligned,
             started: false,
+            rolled_out: latents.len() <= 1,
             start: Start::Cold,
             anchor: Chain::new(1, method.latent.dim()),
             told: told.clone(),
@@ -86,6 +90,7 @@ impl Act {
     pub(super) fn asks(&self, ask: Ask) -> bool {
         match ask {
             Ask::Filter => !self.started,
+            Ask::RollOut => self.started && !self.rolled_out && !self.asks(Ask::Refine),
             Ask::Choose => self.started && !self.choice.made && self.candidates.iter().all(Candidate::is_done) && !self.has_failed(),
             Ask::Refine | Ask::Denoise | Ask::Invert => {
                 self.started && self.candidates.iter().any(|window| window.asks(ask, self.options()))
@@ -174,10 +179,16 @@ impl Act {
         self.candidates.iter_mut().for_each(|window| window.set_latent(position, latent));
     }
 
+    /// The latents of all positions have been set.
+    pub(super) fn set_rolled_out(&mut self) {
+        self.rolled_out = true;
+    }
+
     /// Latents of an oracle: what it was told, as sure as a latent can be.
     pub(super) fn set_truth(&mut self) {
         let Self { candidates, truth, .. } = self;
         candidates.iter_mut().for_each(|window| window.set_truth(truth));
+        self.rolled_out = true;
     }
 
     /// What is told of what is wanted, and 1; zeros where nothing is, or the window is to be denoised without it.
@@ -228,7 +239,7 @@ impl Act {
             return false;
         }
         let Some(stored) = self.episode.take_stored() else { return false };
-        (self.started, self.start) = (true, Start::Warm);
+        (self.started, self.rolled_out, self.start) = (true, true, Start::Warm);
         self.anchor.set(0, stored.anchor());
         for window in &mut self.candidates {
             // Nobody was asked for the latents of now.

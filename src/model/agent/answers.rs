@@ -3,6 +3,7 @@
 
 use super::{
     Act, Agent, Ask,
+    chain::Chain,
     rows::{self, Row, asking, asking_mut, evaluated},
 };
 use crate::model::{
@@ -21,6 +22,7 @@ impl Agent {
         }
         match ask {
             Ask::Filter => self.filter(acts),
+            Ask::RollOut => self.roll_out(acts),
             Ask::Refine => self.refine(acts),
             Ask::Denoise => self.denoise(acts),
             Ask::Invert => self.invert(acts),
@@ -28,22 +30,15 @@ impl Agent {
         }
     }
 
-    /// The filter: latents from real history and the current state; then the windows start.
+    /// The filter: the latent of now from real history and the current state; then the windows start.
     fn filter(&self, acts: &mut [Act]) -> Result<()> {
         let fresh = |act: &Act| act.asks(Ask::Filter);
         if let Some(latent) = &self.networks().latent {
             let memories = self.read_on(latent, acts)?;
             let rows = acts.iter().filter(|act| fresh(act)).map(|act| Row::of(act, &act.candidates()[0]));
             let block = rows::blocks(rows, Evidence::Filter, self.config(), self.walk())?;
-            let filter = latent.infer(&block, memories.as_ref())?;
-            let end = acts.iter().filter(|act| fresh(act)).map(|act| act.candidates()[0].latents().len()).max().unwrap_or(0);
-            let mut position = 0;
-            latent.roll_out(filter, end, |next| {
-                let rows = acts.iter_mut().filter(|act| fresh(act)).zip(rows::latents(next));
-                rows.for_each(|(act, latent)| act.set_latent(position, latent));
-                position += 1;
-                Ok(())
-            })?;
+            let now = latent.coming(latent.infer(&block, memories.as_ref())?)?;
+            acts.iter_mut().filter(|act| fresh(act)).zip(rows::latents(&now)).for_each(|(act, latent)| act.set_latent(0, latent));
         }
         let told = self.config().method.latent.truth().is_some();
         for act in acts.iter_mut().filter(|act| fresh(act)) {
@@ -52,6 +47,28 @@ impl Agent {
             }
             act.start(self.config(), self.walk());
         }
+        Ok(())
+    }
+
+    /// The prior from the latent of now on, one row an act: candidates have the same latents.
+    fn roll_out(&self, acts: &mut [Act]) -> Result<()> {
+        let Some(latent) = &self.networks().latent else { return Ok(()) };
+        let waits = |act: &Act| act.asks(Ask::RollOut);
+        let chains = || acts.iter().filter(|act| waits(act)).map(|act| act.candidates()[0].latents());
+        let shape = [1, self.config().method.latent.dim()];
+        let now = Gaussian {
+            mean: rows::gather(chains(), shape, |chain, out| out.copy_from_slice(chain.get(0).mean))?,
+            log_var: rows::gather(chains(), shape, |chain, out| out.copy_from_slice(chain.get(0).log_var))?,
+        };
+        let later = chains().map(Chain::len).max().unwrap_or(1) - 1;
+        let mut position = 1;
+        latent.roll_out(now, later, |next| {
+            let rows = acts.iter_mut().filter(|act| waits(act)).zip(rows::latents(next));
+            rows.for_each(|(act, latent)| act.set_latent(position, latent));
+            position += 1;
+            Ok(())
+        })?;
+        acts.iter_mut().filter(|act| waits(act)).for_each(Act::set_rolled_out);
         Ok(())
     }
 
@@ -100,7 +117,9 @@ impl Agent {
             set_refined(acts, next, position);
             position += 1;
             Ok(())
-        })
+        })?;
+        acts.iter_mut().filter(|act| act.asks(Ask::Refine)).for_each(Act::set_rolled_out);
+        Ok(())
     }
 
     /// The clean windows, and one row down, or several.
@@ -190,6 +209,7 @@ impl Agent {
     pub(crate) fn read_in_serving(&self, act: Act, row: usize, [x, x_ready, given, actions]: [&[f32]; 4]) -> Result<[Vec<f32>; 5]> {
         let mut acts = [act];
         self.answer(Ask::Filter, &mut acts)?;
+        self.answer(Ask::RollOut, &mut acts)?;
         let ready = acts[0].first_mut().descent_mut().ready_row().unwrap_or(row);
         acts[0].first_mut().stand_at(ready.min(row), x_ready, given, actions);
         self.answer(Ask::Refine, &mut acts)?;

@@ -3,8 +3,10 @@
 /// What an act asks of the networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ask {
-    /// The latents of its windows, from what was really seen; then they start.
+    /// The latent of now, from what was really seen; then its windows start.
     Filter,
+    /// The latents of later positions, each told from the one before; not of windows that are refined first, which brings them too.
+    RollOut,
     /// The latent of position 0 anew, with the noised positions 0 and 1 (zig-zag).
     Refine,
     /// The clean window.
@@ -17,5 +19,5 @@ pub enum Ask {
 
 impl Ask {
     /// In this order they are answered in one tick: an act that has its latents can be denoised at once.
-    pub const ORDER: [Self; 5] = [Self::Filter, Self::Refine, Self::Denoise, Self::Invert, Self::Choose];
+    pub const ORDER: [Self; 6] = [Self::Filter, Self::RollOut, Self::Refine, Self::Denoise, Self::Invert, Self::Choose];
 }

@@ -80,7 +80,7 @@ impl Candidate {
     /// Whether it asks this of the networks now.
     pub(super) fn asks(&self, ask: Ask, options: &SamplerOptions) -> bool {
         match ask {
-            Ask::Filter | Ask::Choose => false,
+            Ask::Filter | Ask::RollOut | Ask::Choose => false,
             Ask::Refine => self.waits() && self.descent.is_ready() && options.kappa > 0.0 && !self.latents.is_empty(),
             Ask::Denoise => self.waits() && !self.descent.is_done(),
             Ask::Invert => !self.descent.has_failed() && !self.waits(),

@@ -136,7 +136,7 @@ mod tests {
         let (episodes, mut rng) = (&loss.episodes.train, Philox::new(3));
         let mut batch = windows(episodes, &loss.places, &loss.shape, None, &mut rng).unwrap();
         let drawn = loss.draw(loss.shape.batch, &mut rng).unwrap();
-        let mut error = |batch: &WindowBatch| loss.loss(agent.networks(), batch, drawn.clone()).unwrap().to_scalar::<f32>().unwrap();
+        let error = |batch: &WindowBatch| loss.loss(agent.networks(), batch, drawn.clone()).unwrap().to_scalar::<f32>().unwrap();
         let before = error(&batch);
         let (first, rest) = (batch.window.i((.., ..2)).unwrap(), batch.window.i((.., 2..)).unwrap());
         batch.window = Tensor::cat(&[&first, &rest.affine(3.0, 1.0).unwrap()], 1).unwrap();
