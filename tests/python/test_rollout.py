@@ -105,6 +105,9 @@ def test_the_table_and_the_markdown_hold_the_numbers() -> None:
     for words in ("-2.00 ± 1.00", "0 of 2", "p50 2.00 ms, p99 2.98 ms", "4.50", "no readout, because", "kappa=inf"):
         assert words in text
     assert "above the first" not in text
+    off = SamplerOptions(eta=0.0, candidates=1, pick_temperature=0.5, guidance_scale=2.0, guidance_samples=3, latent="mean")
+    text = table([Reading(replace(result, options=off), "", None)])
+    assert "guidance_scale=2, guidance_samples=3\n" in text, "what does nothing is not told"
     rows = markdown([result], ["kappa", "streaming"]).splitlines()
     assert len(rows) == 3 and len({row.count("|") for row in rows}) == 1
     assert rows[2].startswith("| point-wind-s | fake | inf | true | -2.00 ± 1.00 | -2.00 | 0/2 | 4.50 |")

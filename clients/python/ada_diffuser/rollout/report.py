@@ -5,11 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import fmean
 
+from ada_diffuser.messages import SamplerOptions
 from ada_diffuser.rollout.choice import Choice, Tried
 from ada_diffuser.rollout.readout import Place, Reading, Readout
 from ada_diffuser.rollout.result import Evaluation, mean_and_error
 from ada_diffuser.rollout.seeds import SeedGroup, by_recipe
 
+#: Options that do nothing at these values, and those that do nothing beside them.
+_OFF: dict[str, tuple[object, ...]] = {
+    "sub_steps": (1,),
+    "eta": (0.0,),
+    "latent": ("mean",),
+    "guidance_scale": (0.0, "guidance_samples"),
+    "free_guidance_scale": (1.0,),
+    "candidates": (1, "pick_temperature"),
+    "picard_window": (1, "picard_tolerance"),
+}
 #: Where differences stand in the table.
 _AFTER_MEDIAN = 6
 
@@ -26,7 +37,7 @@ def table(readings: Sequence[Reading]) -> str:
 
 def _column(reading: Reading) -> list[tuple[str, str]]:
     result, readout = reading.result, reading.readout
-    options = ", ".join(f"{name}={_setting(value)}" for name, value in result.options.given().items())
+    options = ", ".join(f"{name}={_setting(value)}" for name, value in _told(result.options).items())
     call = "batch" if result.trial.vector > 1 else "act"
     return [
         ("environment", result.trial.env),
@@ -43,6 +54,14 @@ def _column(reading: Reading) -> list[tuple[str, str]]:
         ("context readout", f"R² {readout.r2:.3f}" if isinstance(readout, Readout) else readout),
         ("time", f"{result.wall_s:.1f} s"),
     ]
+
+
+def _told(options: SamplerOptions) -> dict[str, object]:
+    """Those in force that do something."""
+    given = options.given()
+    off = {name: others for name, (value, *others) in _OFF.items() if given.get(name) == value}
+    silent = {*off, *(other for others in off.values() for other in others)}
+    return {name: value for name, value in given.items() if name not in silent}
 
 
 def _difference(result: Evaluation, other: Evaluation) -> str:
