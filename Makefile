@@ -7,7 +7,7 @@ MODEL ?= cheetah-wind-s
 RECIPE ?= models/$(MODEL)/recipe.toml
 ENV ?= cheetah-wind-s
 EPISODES ?= 300
-DEMO_EPISODES ?= 32
+DEMO_EPISODES ?= 16
 
 .PHONY: help demo serve collect train test test-rust test-python lint load reliability bench docs proto-python tools clean
 

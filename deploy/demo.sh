@@ -2,7 +2,7 @@
 # Starts the server on a free port, lets HalfCheetah run in a wind that it cannot see and that turns round, with latents and by the same
 # network without them, and leaves numbers, a plot and a film of both in out/.
 set -eu
-episodes=${DEMO_EPISODES:-32}
+episodes=${DEMO_EPISODES:-16}
 python=.venv/bin/python
 mkdir -p out
 port=$($python -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
