@@ -87,6 +87,16 @@ def test_a_report_of_the_same_cells_is_the_same(
     assert all(f"({name})" in text for name in written if name != "README.md")
 
 
+def test_the_report_that_ships_is_of_the_cells_that_ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever commits a cell, or changes a suite or a method, makes the report anew: `ada-suite report`."""
+    monkeypatch.chdir(ROOT)
+    assert main(["report", "--out", str(tmp_path)]) == 0
+    text = (tmp_path / "README.md").read_text(encoding="utf-8")
+    assert text == (ROOT / "report/README.md").read_text(encoding="utf-8")
+    pictures = {path.name for path in tmp_path.glob("*.png")}
+    assert pictures == {path.name for path in (ROOT / "report").glob("*.png")} and all(f"({name})" in text for name in pictures)
+
+
 def test_a_report_leaves_out_what_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one cell there is something to tell; suites that nobody has begun are left out, unless they are named."""
     (tmp_path / "report/suites").mkdir(parents=True)
