@@ -59,12 +59,15 @@ def test_the_order_is_told_in_words_beside_the_papers(tmp_path: Path) -> None:
     assert text is not None and tables.order(results, "streaming") is None
     _, here, there = text.split("\n- ")
     assert (
-        here.startswith("here: above above (+5.1; ") and "; not told apart from level (-0.2; " in here and "; below below (-20.4; " in here
+        here.startswith("here: above above (+5.1; ")
+        and "; not told apart from level (-0.2; 0.1; less in 3 of 6 episodes)" in here
+        and "; below below (-20.4; " in here
     )
     assert here.endswith("**The other way round in the paper: above; apart in the paper and not here: level.**")
     assert "level" not in there and there.endswith(".") and "paper" not in there
     gap = groups["here", "below", "cold"].less(groups["here", "ours", "cold"])
     assert gap is not None and gap.in_errors == pytest.approx(gap.mean / np.hypot(gap.over_seeds, gap.over_episodes))
+    assert groups["here", "below", "cold"].worse_than(groups["here", "ours", "cold"]) == (6, 6)
     assert Estimate(3.0, None, 0.5).in_errors == 6.0 and Estimate(3.0, None, None).in_errors == 0.0
 
 

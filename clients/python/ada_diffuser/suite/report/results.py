@@ -67,6 +67,14 @@ class Group:
         gaps = np.array([mine[seed] - theirs[seed] for seed in mine if seed in theirs])
         return Estimate(float(gaps.mean()), _error(gaps.mean(axis=1)), _error(gaps.mean(axis=0))) if len(gaps) else None
 
+    def worse_than(self, other: Group) -> tuple[int, int]:
+        """In how many episodes it earned less, and of how many, of the training seeds that both have: what one episode that flies off says
+        nothing about.
+        """
+        mine, theirs = self._by_seed(), other._by_seed()
+        worse = np.array([mine[seed] < theirs[seed] for seed in mine if seed in theirs])
+        return int(worse.sum()), worse.size
+
     def _by_seed(self) -> dict[int, NDArray[np.float64]]:
         return {file["seed"]: row for file, row in zip(self.files, self.returns, strict=True)}
 

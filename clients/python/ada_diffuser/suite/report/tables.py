@@ -114,15 +114,12 @@ def order(results: Results, mode: Mode) -> str | None:
             continue
         mine = {method.name: results.group(environment, method.name, mode) for method in results.methods if method.name != reference}
         gaps = {name: gap for name, group in mine.items() if group and (gap := group.less(theirs))}
-        told = [
-            f"{side} {', '.join(f'{name} ({gap.mean:+.1f}; {abs(gap.in_errors):.1f})' for name, gap in found.items())}"
-            for side, found in (
-                ("above", {name: gap for name, gap in gaps.items() if gap.in_errors > CLEAR}),
-                ("not told apart from", {name: gap for name, gap in gaps.items() if abs(gap.in_errors) <= CLEAR}),
-                ("below", {name: gap for name, gap in gaps.items() if gap.in_errors < -CLEAR}),
-            )
-            if found
-        ]
+        sides: dict[str, list[str]] = {"above": [], "not told apart from": [], "below": []}
+        for name, gap in gaps.items():
+            side = "above" if gap.in_errors > CLEAR else "below" if gap.in_errors < -CLEAR else "not told apart from"
+            less = "; less in {} of {} episodes".format(*mine[name].worse_than(theirs)) if side == "not told apart from" else ""
+            sides[side].append(f"{name} ({gap.mean:+.1f}; {abs(gap.in_errors):.1f}{less})")
+        told = [f"{side} {', '.join(names)}" for side, names in sides.items() if names]
         if told:
             lines.append(f"- {environment}: {'; '.join(told)}.{_against_the_paper(results.suite, environment, gaps)}")
     if not lines:
@@ -130,7 +127,8 @@ def order(results: Results, mode: Mode) -> str | None:
     caption = (
         f"In words, {mode}: who is above {reference}, who cannot be told apart from it (within {CLEAR:.0f} standard errors) and who is "
         "below; in brackets by how much, and how many standard errors of the difference that is, those over training seeds and over "
-        "episodes pooled."
+        "episodes pooled. A single episode that flies off makes a mean and its errors: so it is also told in how many of them less was "
+        "earned."
     )
     return f"*{caption}*\n\n" + "\n".join(lines)
 
