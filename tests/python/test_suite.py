@@ -358,7 +358,7 @@ def test_the_readme_has_an_example_of_every_key(tmp_path: Path) -> None:
     (example,) = re.findall(r"^```toml\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     (tmp_path / "example.toml").write_text(example, encoding="utf-8")
     suite = Suite.load(tmp_path / "example.toml")
-    assert len(suite.methods) == 3 + 5 and len(cells(suite)) == 3 * (2 + 2 + 1 + 5)
+    assert len(suite.methods) == 3 + 5 and len(cells(suite)) == 3 * (2 + 1 + 1 + 5)
     for key in (
         "title",
         "seeds",
