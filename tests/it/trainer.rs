@@ -210,7 +210,7 @@ fn mistakes_get_one_clear_line() {
         (trainer, vec!["inspect", broken.to_str().unwrap()], "config.json"),
         (trainer, vec!["defaults", "models/tiny", to, "--set", "sampler.kapa=1"], "unknown field `kapa`"),
         (server, vec!["--models", "nowhere"], "models.dir nowhere"),
-        (server, vec!["--models", "models", "--default-model", "nobody", "--listen", "127.0.0.1:0"], "there are: cheetah-vel-e"),
+        (server, vec!["--models", "models", "--default-model", "nobody", "--listen", "127.0.0.1:0"], "there are: cheetah-gale-s,"),
         (server, vec!["--set", "engine.wrokers=2"], "wrokers"),
         (server, vec!["--config", "nowhere.toml"], "nowhere.toml"),
         (server, vec!["--listen", "192.0.2.1:1"], "server.listen 192.0.2.1:1"),
