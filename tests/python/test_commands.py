@@ -71,7 +71,7 @@ def test_a_rollout_has_the_environments_options(
     """`ada-evaluate` alone took them, so that no film could be made of the speeds that it was asked about."""
     words = ["--env", "point-wind-s", "--url", address, "--model", "tiny", "--episodes", "1", "--episode-steps", "6"]
     told, filmed = [], []
-    monkeypatch.setattr(film, "save_film", lambda env, episode, readout, path, env_options: filmed.append(env_options))
+    monkeypatch.setattr(film, "save_film", lambda panels, path: filmed.append(panels[0].env_options))
     for options in ([], ["--env-option", "sigma=0.5"]):
         assert rollout.main([*words, *options, "--json", "a.json", "--film", "a.gif"]) == 0
         told.append(json.loads(Path("a.json").read_text()))
