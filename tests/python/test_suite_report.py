@@ -47,6 +47,7 @@ def test_the_order_is_told_in_words_beside_the_papers(tmp_path: Path) -> None:
 
     suite = replace(
         Suite.load(GOLDEN / "golden.toml"),
+        episodes=3,
         environments={"here": None, "there": None},
         methods={name: SimpleNamespace(name=name) for name in ("ours", "above", "level", "below", "nobody")},
         paper={"here": {"ours": -10, "above": -12.0, "level": -20, "below": "-1 (made up)"}},
@@ -54,6 +55,7 @@ def test_the_order_is_told_in_words_beside_the_papers(tmp_path: Path) -> None:
     found = {"ours": (-10, -10.2), "above": (-5, -5.1), "level": (-9, -11.5), "below": (-30, -31)}
     groups = {(place, name, "cold"): cells(name, *means) for name, means in found.items() for place in ("here", "there")}
     del groups["there", "level", "cold"]
+    groups["there", "below", "cold"].files.pop()
     results = Results(suite, groups, 0, 0, 0)
     text = tables.order(results, "cold")
     assert text is not None and tables.order(results, "streaming") is None
@@ -63,7 +65,8 @@ def test_the_order_is_told_in_words_beside_the_papers(tmp_path: Path) -> None:
         and "; not told apart from level (-0.2; 0.1; less in 3 of 6 episodes)" in here
         and "; below below (-20.4; " in here
     )
-    assert here.endswith("**The other way round in the paper: above; apart in the paper and not here: level.**")
+    assert here.endswith("**The other way round in the paper: above. Apart in the paper and not here: level.**")
+    assert there.endswith("less in 3 of 3 episodes; 1 of 2 training seeds).") and "of 2" not in here
     assert "level" not in there and there.endswith(".") and "paper" not in there
     gap = groups["here", "below", "cold"].less(groups["here", "ours", "cold"])
     assert gap is not None and gap.in_errors == pytest.approx(gap.mean / np.hypot(gap.over_seeds, gap.over_episodes))

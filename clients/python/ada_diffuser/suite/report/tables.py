@@ -117,8 +117,11 @@ def order(results: Results, mode: Mode) -> str | None:
         sides: dict[str, list[str]] = {"above": [], "not told apart from": [], "below": []}
         for name, gap in gaps.items():
             side = "above" if gap.in_errors > CLEAR else "below" if gap.in_errors < -CLEAR else "not told apart from"
-            less = "; less in {} of {} episodes".format(*mine[name].worse_than(theirs)) if side == "not told apart from" else ""
-            sides[side].append(f"{name} ({gap.mean:+.1f}; {abs(gap.in_errors):.1f}{less})")
+            worse, of = mine[name].worse_than(theirs)
+            less = f"; less in {worse} of {of} episodes" if side == "not told apart from" else ""
+            seeds = of // results.suite.episodes
+            few = f"; {seeds} of {_seeds(results)}" if seeds < len(results.suite.seeds) else ""
+            sides[side].append(f"{name} ({gap.mean:+.1f}; {abs(gap.in_errors):.1f}{less}{few})")
         told = [f"{side} {', '.join(names)}" for side, names in sides.items() if names]
         if told:
             lines.append(f"- {environment}: {'; '.join(told)}.{_against_the_paper(results.suite, environment, gaps)}")
@@ -144,9 +147,9 @@ def _against_the_paper(suite: Suite, environment: str, gaps: Mapping[str, Estima
         return ""
     other = [name for name, gap in known.items() if gaps[name].in_errors * gap < 0 and abs(gaps[name].in_errors) > CLEAR]
     unclear = [name for name in known if abs(gaps[name].in_errors) <= CLEAR]
-    said = [f"the other way round in the paper: {', '.join(other)}"] if other else []
-    said += [f"apart in the paper and not here: {', '.join(unclear)}"] if unclear else []
-    return f" **{'; '.join(said).capitalize()}.**" if said else " As in the paper."
+    said = [f"The other way round in the paper: {', '.join(other)}."] if other else []
+    said += [f"Apart in the paper and not here: {', '.join(unclear)}."] if unclear else []
+    return f" **{' '.join(said)}**" if said else " As in the paper."
 
 
 def cost(results: Results) -> str:
