@@ -66,12 +66,14 @@ def test_the_order_is_told_in_words_beside_the_papers(tmp_path: Path) -> None:
         and "; below below (-20.4; " in here
     )
     assert here.endswith("**The other way round in the paper: above. Apart in the paper and not here: level.**")
-    assert there.endswith("less in 3 of 3 episodes; 1 of 2 training seeds).") and "of 2" not in here
+    # Less by the same in every episode: nothing spreads, and nothing is clearer.
+    assert there.endswith("; below below (-20.0; inf; 1 of 2 training seeds).") and "of 2" not in here
     assert "level" not in there and there.endswith(".") and "paper" not in there
     gap = groups["here", "below", "cold"].less(groups["here", "ours", "cold"])
     assert gap is not None and gap.in_errors == pytest.approx(gap.mean / np.hypot(gap.over_seeds, gap.over_episodes))
     assert groups["here", "below", "cold"].worse_than(groups["here", "ours", "cold"]) == (6, 6)
     assert Estimate(3.0, None, 0.5).in_errors == 6.0 and Estimate(3.0, None, None).in_errors == 0.0
+    assert Estimate(-3.0, 0.0, 0.0).in_errors == -np.inf and Estimate(0.0, 0.0, 0.0).in_errors == 0.0
 
 
 def test_a_report_of_the_same_cells_is_the_same(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,9 +28,12 @@ class Estimate:
 
     @property
     def in_errors(self) -> float:
-        """The mean over its standard error, both kinds pooled: the root of the sum of their squares. 0 where there is none."""
+        """The mean over its standard error, both kinds pooled: the root of the sum of their squares. 0 where there is none; infinite where
+        nothing spreads, as where every episode earns the same."""
+        if self.mean == 0.0 or (self.over_seeds is None and self.over_episodes is None):
+            return 0.0
         error = float(np.hypot(self.over_seeds or 0.0, self.over_episodes or 0.0))
-        return self.mean / error if error else 0.0
+        return self.mean / error if error else math.copysign(math.inf, self.mean)
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Estimate:
