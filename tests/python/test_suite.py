@@ -305,13 +305,24 @@ def test_what_samplers_ask_is_nothing_to_train_for(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(text.replace('reference = "ours"', ""), encoding="utf-8")
     suite = Suite.load(tmp_path / "a.toml")
     assert list(suite.methods) == ["ours,sampler.kappa=0.0", "ours,sampler.kappa=inf", "ours,model.latent.dim=3", "diffuser"]
-    off, on, narrow, _ = suite.methods.values()
-    assert (
-        off.training_keys == on.training_keys and on.default_keys == ["sampler.kappa=inf"] and on.varied == ("sampler.kappa", float("inf"))
-    )
+    off, on, narrow, _ = cells(suite)
+    assert off.training_keys == on.training_keys and on.default_keys == ["sampler.kappa=inf"]
+    assert on.method.varied == ("sampler.kappa", float("inf"))
     assert "model.latent.dim=3" in narrow.training_keys and not narrow.default_keys
-    method = replace(on, keys=("sampler.sub_steps=2", "restart.latent_jump=1"))
-    assert method.training_keys == ["sampler.sub_steps=2"], "sub-steps are trained"
+    finer = replace(on, method=replace(on.method, keys=("sampler.sub_steps=2", "restart.latent_jump=1")))
+    assert finer.training_keys == ["sampler.sub_steps=2"], "sub-steps are trained"
+
+
+def test_what_an_environment_sets_all_methods_have_and_may_overrule(tmp_path: Path) -> None:
+    text = TINY.replace("[environments.point-wind-s]", "[environments.point-wind-s]\nset = ['stages.denoise.steps=7', 'sampler.kappa=0.0']")
+    (tmp_path / "a.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "b.toml").write_text(TINY, encoding="utf-8")
+    ours, diffuser = cells(Suite.load(tmp_path / "a.toml"))
+    for one in (ours, diffuser):
+        assert one.training_keys[0] == "stages.denoise.steps=7" and one.default_keys[0] == "sampler.kappa=0.0"
+        assert one.training_keys[1:] == [key for key in one.method.keys if not key.startswith("sampler.kappa")]
+    plain = cells(Suite.load(tmp_path / "b.toml"))[0]
+    assert plain.training(Places()) != ours.training(Places()) and plain.key("streaming") != ours.key("streaming")
 
 
 def test_durations_tell_how_long_the_rest_takes() -> None:

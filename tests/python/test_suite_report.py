@@ -38,6 +38,15 @@ def test_standard_errors_are_over_seeds_and_over_episodes() -> None:
     assert estimate(group(s0=[-10.0, -14.0]).estimate) == "-12.0 ± - ± 2.0" and estimate(None) == "-"
 
 
+def test_a_smaller_budget_is_told_with_the_scale() -> None:
+    suite = Suite.load(GOLDEN / "golden.toml")
+    results = Results.load(suite, GOLDEN / "cells")
+    assert "All methods" not in tables.scale(results)
+    here = replace(suite.environments["point-wind-s"], keys=("stages.denoise.steps=7", "sampler.kappa=0.0"))
+    text = tables.scale(replace(results, suite=replace(suite, environments={"point-wind-s": here})))
+    assert " All methods of point-wind-s have `stages.denoise.steps=7`, `sampler.kappa=0.0`. Machine: " in text
+
+
 def test_the_order_is_told_in_words_beside_the_papers(tmp_path: Path) -> None:
     """What is clear, what is not, and what the paper has otherwise."""
 

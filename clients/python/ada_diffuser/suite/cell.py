@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ada_diffuser.dataset import card_path, sha256
-from ada_diffuser.suite.suite import Environment, Method, Mode, Suite
+from ada_diffuser.suite.suite import Environment, Method, Mode, Suite, is_trained
 from ada_diffuser.suite.toml import loads
 
 
@@ -44,6 +44,21 @@ class Cell:
     def recipe(self) -> Path:
         return self.method.recipes[self.environment.name]
 
+    @property
+    def keys(self) -> list[str]:
+        """`KEY=VALUE`: what is set in the recipe, the environment's before the method's."""
+        return [*self.environment.keys, *self.method.keys]
+
+    @property
+    def training_keys(self) -> list[str]:
+        """Those that the training depends on."""
+        return [key for key in self.keys if is_trained(key)]
+
+    @property
+    def default_keys(self) -> list[str]:
+        """The others, which change the defaults of the finished checkpoint."""
+        return [key for key in self.keys if not is_trained(key)]
+
     def file(self, places: Places, mode: Mode) -> Path:
         """What it found in this mode."""
         return places.cells / self.suite.name / self.environment.name / self.method.name / f"seed{self.seed}-{mode}.json"
@@ -70,7 +85,7 @@ class Cell:
         return _digest(
             {
                 "training": self._training_key,
-                "defaults": self.method.default_keys,
+                "defaults": self.default_keys,
                 "world": self._world,
                 "mode": mode,
                 "episodes": self.suite.episodes,
@@ -86,7 +101,7 @@ class Cell:
         told = {name: value for name, value in recipe.items() if name not in ("name", "data", "seed")}
         data = self._collected if self.environment.data is None else _known_digest(self.environment)
         changed = {"with": changes} if changes else {}
-        return _digest({"recipe": told, **changed, "set": self.method.training_keys, "seed": self.seed, "data": data})
+        return _digest({"recipe": told, **changed, "set": self.training_keys, "seed": self.seed, "data": data})
 
     def _read(self, key: str, path: Path) -> dict[str, Any]:
         try:

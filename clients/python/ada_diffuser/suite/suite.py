@@ -38,6 +38,8 @@ class Environment:
     data: Path | None
     #: What methods change that name no recipe of their own.
     recipe: Path | None = None
+    #: `KEY=VALUE`, what all methods have there; a method's own come after them.
+    keys: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -55,16 +57,6 @@ class Method:
     #: The method that this is a variant of, and which key has which value in it.
     family: str
     varied: tuple[str, Any] | None = None
-
-    @property
-    def training_keys(self) -> list[str]:
-        """Those of `keys` that a training depends on."""
-        return [key for key in self.keys if not _AFTERWARDS.fullmatch(_name_of(key))]
-
-    @property
-    def default_keys(self) -> list[str]:
-        """The others, which change the defaults of a finished checkpoint."""
-        return [key for key in self.keys if _AFTERWARDS.fullmatch(_name_of(key))]
 
 
 @dataclass(frozen=True)
@@ -144,6 +136,7 @@ def _environment(name: str, table: Table) -> Environment:
     collect: dict[str, Any] | None = table.take("collect", dict, None)
     data: str | None = table.take("data", str, None)
     recipe: str | None = table.take("recipe", str, None)
+    keys = _keys(table)
     table.end()
     if (collect is None) == (data is None):
         raise table.wrong(
@@ -154,7 +147,15 @@ def _environment(name: str, table: Table) -> Environment:
             raise table.wrong(f"collect.{flag}", "is said by the suite itself; env, options and episode_steps stand beside collect")
         if not isinstance(value, (str, int, float)):
             raise table.wrong(f"collect.{flag}", f"must be what stands behind ada-collect --{flag}, not {value!r}")
-    return Environment(name, env, options, steps, collect, _path(data), _path(recipe))
+    return Environment(name, env, options, steps, collect, _path(data), _path(recipe), keys)
+
+
+def _keys(table: Table) -> tuple[str, ...]:
+    keys = tuple(table.take("set", list[str], []))
+    for key in keys:
+        if not key.partition("=")[1]:
+            raise table.wrong("set", f"has {key!r}, which is not KEY=VALUE")
+    return keys
 
 
 def _path(text: str | None) -> Path | None:
@@ -166,13 +167,10 @@ def _methods(name: str, table: Table, environments: Mapping[str, Environment], m
     _check_name(name)
     recipes = _recipes(table, environments)
     changes = tuple(Path(path) for path in table.take("with", list[str], []))
-    keys = tuple(table.take("set", list[str], []))
+    keys = _keys(table)
     modes = _modes(table, modes)
     vary: dict[str, Any] = table.take("vary", dict, {})
     table.end()
-    for key in keys:
-        if not key.partition("=")[1]:
-            raise table.wrong("set", f"has {key!r}, which is not KEY=VALUE")
     for key, values in vary.items():
         if not isinstance(values, list) or not values:
             raise table.wrong(f"vary.{key}", f"must be a list of values, not {values!r}")
@@ -218,5 +216,6 @@ def _check_name(name: str) -> None:
         raise ValueError(f"{name!r} cannot be the name of a file: letters, digits and _.,=+- will do, 100 at most")
 
 
-def _name_of(key: str) -> str:
-    return key.partition("=")[0].strip()
+def is_trained(key: str) -> bool:
+    """Whether a training depends on this `KEY=VALUE`; else it changes the defaults of a finished checkpoint."""
+    return not _AFTERWARDS.fullmatch(key.partition("=")[0].strip())

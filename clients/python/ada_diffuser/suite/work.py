@@ -76,7 +76,7 @@ def _facts(cell: Cell, told: dict[str, Any], data: Path) -> dict[str, Any]:
     return {
         "recipe": str(cell.recipe),
         "with": [str(path) for path in cell.method.changes],
-        "set": list(cell.method.keys),
+        "set": cell.keys,
         "steps": {stage["name"]: stage["steps"] for stage in recipe["stages"]},
         "parameters": sum(told["parameters"].values()),
         "checkpoint": told["digest"],
@@ -118,7 +118,7 @@ def _trained(cell: Cell, places: Places, programs: Programs, data: Path) -> tupl
 
         words = ["--seed", str(cell.seed), "--data", str(data), "--out", str(run)]
         words += [text for path in cell.method.changes for text in ("--with", str(path))]
-        words += [text for key in cell.method.training_keys for text in ("--set", key)]
+        words += [text for key in cell.training_keys for text in ("--set", key)]
         _say(f"trains {run}")
         _run("ada-trainer run", [programs.trainer, "run", str(cell.recipe), *words], spent)
         return run, spent(finished=True)
@@ -130,8 +130,8 @@ def _served(cell: Cell, programs: Programs, run: Path, model: Path) -> Path:
     model.mkdir(parents=True)
     for name in _CHECKPOINT:
         shutil.copyfile(run / name, model / name)
-    if cell.method.default_keys:
-        programs.defaults(model, model, cell.method.default_keys)
+    if cell.default_keys:
+        programs.defaults(model, model, cell.default_keys)
     return model
 
 

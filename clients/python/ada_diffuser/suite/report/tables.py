@@ -48,9 +48,14 @@ def scale(results: Results) -> str:
     )
     if results.stale:
         there += f" {results.stale} were measured before the suite, a recipe or the data was changed; `ada-suite run` does them again."
+    budget = "".join(
+        f" All methods of {name} have `{'`, `'.join(suite.environments[name].keys)}`."
+        for name in results.environments
+        if suite.environments[name].keys
+    )
     return (
         f"Training seeds {seeds}; {suite.episodes} episodes each, environment seeds from {suite.first_seed} on, the same for all methods. "
-        f"Data: {'; '.join(data.values())}. Machine: {'; '.join(machines)}.{there}"
+        f"Data: {'; '.join(data.values())}.{budget} Machine: {'; '.join(machines)}.{there}"
     )
 
 
