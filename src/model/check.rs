@@ -213,6 +213,10 @@ impl ModelConfig {
                 }
             }
         }
+        let held = latent.gru().is_some() && !self.method.can_refine() && schedule.is_ladder();
+        let single = *diffused != Diffused::Action || !held || self.trained.action_horizons == [1];
+        let reason = "of a policy on a ladder whose belief is held must be [1]: the belief of a later action would be one without a state";
+        require(single, "trained.action_horizons", reason)?;
         denoiser::check(plan)?;
         require(clip.is_finite() && *clip > 0.0, "method.plan.clip", format!("is {clip}, must be positive and finite"))
     }
@@ -251,8 +255,8 @@ impl ModelConfig {
 /// Actions are part of the plan, or found by inverse dynamics.
 fn check_head(diffused: Diffused, head: &Head, latent: &LatentSource) -> Result<(), Unfit> {
     match (diffused, head) {
-        (Diffused::StateAction, Head::Direct) => Ok(()),
-        (Diffused::StateAction, Head::Inverse { .. }) => {
+        (Diffused::StateAction | Diffused::Action, Head::Direct) => Ok(()),
+        (Diffused::StateAction | Diffused::Action, Head::Inverse { .. }) => {
             require(false, "method.head", "must be direct where actions are diffused: they are there already")
         }
         (Diffused::State, Head::Direct) => {
@@ -274,7 +278,11 @@ fn check_head(diffused: Diffused, head: &Head, latent: &LatentSource) -> Result<
 fn check_guide(guide: Option<&Guide>, plan: &Diffusion, latent: &LatentSource) -> Result<(), Unfit> {
     match guide {
         None => Ok(()),
-        Some(Guide::Value { widths }) => check_value(widths, plan.horizon),
+        Some(Guide::Value { widths }) => {
+            let sees = plan.diffused != Diffused::Action;
+            require(sees, "method.guide", "value needs windows with states: actions alone do not say where they are taken")?;
+            check_value(widths, plan.horizon)
+        }
         Some(Guide::DecoderReturn) => {
             // Beside a baseline the decoder tells what is surprising of a reward, and the rest is not the latent's.
             let tells = latent.gru().is_some_and(|gru| gru.baseline.is_none());

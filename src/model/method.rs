@@ -162,6 +162,8 @@ pub enum Diffused {
     StateAction,
     /// The state alone; position 0, the current one, is known and stands clean in every row.
     State,
+    /// The action alone: a policy (section 4.2 of the paper; Chi et al. 2023). The real steps up to the current state are told it beside.
+    Action,
 }
 
 impl Diffused {
@@ -172,7 +174,7 @@ impl Diffused {
     /// The first position that is not wholly known.
     pub fn first_free(self) -> usize {
         match self {
-            Self::StateAction => 0,
+            Self::StateAction | Self::Action => 0,
             Self::State => 1,
         }
     }
@@ -253,7 +255,7 @@ impl Schedule {
 }
 
 /// The network of a denoiser, and its sizes.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Backbone {
     /// Temporal U-Net (Janner et al. 2022) with a linear skip from input to output; the horizon must be divisible by `2^(widths - 1)`.
@@ -273,6 +275,21 @@ pub enum Backbone {
         /// How it is told the real steps before the window.
         #[serde(default, skip_serializing_if = "History::is_vector")]
         history: History,
+    },
+    /// Encoder and decoder (Vaswani et al. 2017, as in diffusion policy, Chi et al. 2023) with the same skip: the encoder reads the level, the
+    /// real steps and what is told, a token each; positions of the window look at it, at themselves and at those before them. Where there
+    /// is nothing but the level to be read, it stands in front of the window, and there is no encoder.
+    EncoderDecoder {
+        /// Width of a token.
+        width: usize,
+        /// Number of the decoder's blocks.
+        depth: usize,
+        /// Attention heads.
+        heads: usize,
+        /// Number of the encoder's blocks; 0 is a small network for each token by itself.
+        encoder_depth: usize,
+        /// Share of numbers that are zeroed by chance in training (Srivastava et al. 2014).
+        dropout: f32,
     },
 }
 
@@ -322,6 +339,14 @@ impl Method {
 }
 
 impl Backbone {
+    /// Share of numbers that are zeroed by chance in training.
+    pub fn dropout(&self) -> f32 {
+        match self {
+            Self::Unet { .. } | Self::Dit { .. } => 0.0,
+            Self::EncoderDecoder { dropout, .. } => *dropout,
+        }
+    }
+
     /// A transformer that is told the real steps as one vector.
     pub fn dit(width: usize, depth: usize, heads: usize) -> Self {
         Self::Dit { width, depth, heads, history: History::Vector }
@@ -334,6 +359,21 @@ impl Diffusion {
         match self.diffused {
             Diffused::StateAction => state_dim + action_dim,
             Diffused::State => state_dim,
+            Diffused::Action => action_dim,
         }
+    }
+
+    /// Real steps that the denoiser is given beside the window, and numbers of each: state and action of those before the current one, which
+    /// the window itself begins with; of a window of actions the current one too, whose action is zeros, and how long ago each of them was.
+    pub fn observed(&self, [state_dim, action_dim]: [usize; 2]) -> [usize; 2] {
+        match self.diffused {
+            Diffused::StateAction | Diffused::State => [self.obs_horizon.saturating_sub(1), state_dim + action_dim],
+            Diffused::Action => [self.obs_horizon, state_dim + action_dim + 1],
+        }
+    }
+
+    /// How a network is told that a real step was so many steps before the window's first.
+    pub fn age(&self, steps: usize) -> f32 {
+        steps as f32 / self.horizon as f32
     }
 }

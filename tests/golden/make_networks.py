@@ -8,7 +8,8 @@ which holds it exactly. Activations are channels last; gradients are those of th
 `<case>.in.<input>`, `.y.<result>`, `.r.<result>`, `.p.<parameter>`, `.d.<input>`, `.dp.<parameter>`; parameters have the names of a
 checkpoint. The networks are written after the papers, in PyTorch's
 modules: the U-Net of Janner et al. 2022 with the mean level of a window as its time, half of it as the value of a window, the
-transformer of Peebles and Xie 2023 with a level for each token, and the encoder, prior and decoder of the paper's appendix A.4.
+transformer of Peebles and Xie 2023 with a level for each token, the encoder and decoder of Chi et al. 2023 with the same, and the encoder,
+prior and decoder of the paper's appendix A.4.
 """
 
 from __future__ import annotations
@@ -163,6 +164,101 @@ class ToldDenoiser(nn.Module):
         x = torch.cat([given["x"], given["latents"], sinusoid(given["levels"], Denoiser.LEVEL)], -1)
         steps = given["observed"].unflatten(2, (-1, STATE + ACTION))[:, 0]
         return {"x0": self.backbone(x, given["levels"], self.told(given["told"][:, 0]), steps) + self.input_skip(x)}
+
+
+class Selves(nn.Module):
+    """Pre-norm self-attention, with the residual."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm, self.attention = nn.LayerNorm(width), nn.MultiheadAttention(width, heads, batch_first=True)
+
+    def forward(self, x: Tensor, causal: bool) -> Tensor:
+        h, mask = self.norm(x), nn.Transformer.generate_square_subsequent_mask(x.shape[1]) if causal else None
+        return x + self.attention(h, h, h, need_weights=False, attn_mask=mask, is_causal=causal)[0]
+
+
+class Cross(nn.Module):
+    """Pre-norm attention on other tokens, with the residual."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm, self.heads = nn.LayerNorm(width), heads
+        self.q, self.kv, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
+
+    def forward(self, x: Tensor, others: Tensor) -> Tensor:
+        q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.q(self.norm(x)), *self.kv(others).chunk(2, -1)))
+        return x + self.out(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+
+
+class TransformerBlock(nn.Module):
+    """Of an encoder, or with `cross` of a decoder."""
+
+    def __init__(self, width: int, heads: int, cross: bool) -> None:
+        super().__init__()
+        self.add_module("self", Selves(width, heads))
+        self.cross = Cross(width, heads) if cross else None
+        self.norm = nn.LayerNorm(width)
+        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU("tanh"), nn.Linear(4 * width, width))
+
+    def forward(self, x: Tensor, others: Tensor | None, causal: bool) -> Tensor:
+        x = self.get_submodule("self")(x, causal)
+        x = x if self.cross is None else self.cross(x, others)
+        return x + self.mlp(self.norm(x))
+
+
+def placed(x: Tensor) -> Tensor:
+    """Each step beside its place, as one of so many."""
+    return torch.cat([x, torch.eye(x.shape[1]).expand(x.shape[0], -1, -1)], -1)
+
+
+class EncoderDecoder(nn.Module):
+    """The policy of Chi et al. 2023 with a level and a latent for each position, and the mean level as the time."""
+
+    def __init__(self, d_in: int, d_out: int, steps: tuple[int, int], sizes: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        width, heads, encoder_depth, depth = sizes
+        horizon, observed = steps
+        self.level, self.input, self.reads = nn.Linear(width, width), nn.Linear(d_in + horizon, width), observed > 0
+        if self.reads:
+            self.step = nn.Linear(STATE + ACTION + 1 + observed, width)
+            blocks = [TransformerBlock(width, heads, False) for _ in range(encoder_depth)]
+            each = [nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width)]
+            self.encoder = nn.ModuleList(blocks or each)
+        self.blocks = nn.ModuleList(TransformerBlock(width, heads, self.reads) for _ in range(depth))
+        self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, d_out)
+
+    def forward(self, x: Tensor, levels: Tensor, observed: Tensor | None, told: Tensor | None) -> Tensor:
+        time, h = self.level(sinusoid(levels.mean(1), self.norm.normalized_shape[0]))[:, None], self.input(placed(x))
+        if not self.reads:
+            h = torch.cat([time, h], 1)
+            for block in self.blocks:
+                h = block(h, None, True)
+            return self.out(self.norm(h[:, 1:]))
+        read = torch.cat([time, self.step(placed(observed)), *([] if told is None else [told[:, None]])], 1)
+        for layer in self.encoder:
+            read = layer(read, None, False) if isinstance(layer, TransformerBlock) else layer(read)
+        for block in self.blocks:
+            h = block(h, read, True)
+        return self.out(self.norm(h))
+
+
+class Policy(nn.Module):
+    """That network over window, latents and level embedding, with the linear skip; of actions alone where it is given real steps."""
+
+    def __init__(self, latent: int, told: int, steps: tuple[int, int], sizes: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        d_out = ACTION if steps[1] else STATE + ACTION
+        d_in = d_out + latent + Denoiser.LEVEL
+        self.backbone, self.input_skip = EncoderDecoder(d_in, d_out, steps, sizes), nn.Linear(d_in, d_out)
+        self.told = nn.Sequential(nn.Linear(told + 1, 128), nn.SiLU(), nn.Linear(128, sizes[0])) if told else None
+
+    def forward(self, given: Tensors) -> Tensors:
+        parts = [given["x"], given.get("latents"), sinusoid(given["levels"], Denoiser.LEVEL)]
+        x = torch.cat([part for part in parts if part is not None], -1)
+        observed = given["observed"].unflatten(2, (-1, STATE + ACTION + 1))[:, 0] if "observed" in given else None
+        told = None if self.told is None else self.told(given["told"][:, 0])
+        return {"x0": self.backbone(x, given["levels"], observed, told) + self.input_skip(x)}
 
 
 class Inverse(nn.Sequential):
@@ -428,6 +524,22 @@ def last_cases() -> dict[str, tuple[nn.Module, Tensors]]:
     }
 
 
+def policy_cases() -> dict[str, tuple[nn.Module, Tensors]]:
+    """And once those are."""
+
+    def given(batch: int, steps: int, latent: int, observed: int) -> Tensors:
+        given = window(batch, steps, latent, 1)
+        if observed:
+            given |= {"x": torch.randn(batch, steps, ACTION), "observed": torch.randn(batch, 1, observed * (STATE + ACTION + 1))}
+        return given
+
+    return {
+        "policy": (Policy(4, 2, (7, 3), (12, 3, 2, 2)), given(3, 7, 4, 3) | {"told": torch.randn(3, 1, 3)}),
+        "policy_each": (Policy(0, 0, (5, 1), (10, 1, 0, 1)), given(2, 5, 0, 1)),
+        "policy_alone": (Policy(3, 0, (3, 0), (6, 3, 0, 2)), given(5, 3, 3, 0)),
+    }
+
+
 def our_name(name: str) -> str:
     """The name of a PyTorch parameter in a checkpoint."""
     name = name.removeprefix("backbone.")
@@ -512,7 +624,8 @@ def main() -> None:
     torch.set_default_dtype(torch.float64)
     done = results(cases())
     done |= results(later_cases())
-    save(Path(__file__).with_name("networks.safetensors"), last_cases(), process() | done)
+    done |= results(last_cases())
+    save(Path(__file__).with_name("networks.safetensors"), policy_cases(), process() | done)
 
 
 if __name__ == "__main__":

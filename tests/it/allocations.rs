@@ -185,10 +185,10 @@ fn a_gradient_allocates_nothing() {
     let sizes = Sizes { columns: 5, latent_dim: 5, horizon: 8, widths: &[8, 16] };
     let value = frozen(|params| Value::new(sizes, 40, &params.with_way_back()).unwrap());
     let denoise = |networks: &Networks, x: Traced, latents: &Traced, levels: &[f32]| {
-        networks.denoiser.predict(&x, &Given { levels, latents: Some(latents), observed: None, told: None })
+        networks.denoiser.predict(&x, &Given { latents: Some(latents), ..Given::levels(levels) })
     };
     let runs: [Run; 3] = [
-        &|[x, latents], levels| value.predict(&x, &Given { levels, latents: Some(&latents), observed: None, told: None }),
+        &|[x, latents], levels| value.predict(&x, &Given { latents: Some(&latents), ..Given::levels(levels) }),
         &|[x, latents], levels| denoise(&unet, x, &latents, levels),
         &|[x, latents], levels| denoise(&dit, x, &latents, levels),
     ];

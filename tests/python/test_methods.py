@@ -20,8 +20,11 @@ from ada_diffuser.rollout import Trial, evaluate
 TRAINER = Path(os.environ.get("ADA_TRAINER", ROOT / "target/release/ada-trainer"))
 RECIPE = ROOT / "models/point-wind-s/recipe.toml"
 METHODS = sorted((ROOT / "models/methods").glob("*.toml"))
+TINY_NETWORK = {
+    False: 'model.plan.backbone={kind="dit",width=16,depth=1,heads=2}',
+    True: 'model.plan.backbone={kind="encoder_decoder",width=16,depth=1,heads=2,encoder_depth=1,dropout=0.1}',
+}
 TINY = [
-    'model.plan.backbone={kind="dit",width=16,depth=1,heads=2}',
     "losses.denoise.batch=4",
     "stages.denoise.steps=4",
     "stages.denoise.learning_rate.warm_up=1",
@@ -38,8 +41,9 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert collect(["--env", "point-wind-s", "--episodes", "12", "--quiet", "--out", str(data)]) == 0
     for method in [None, *METHODS]:
         name = method.stem if method else "plain"
-        latent = method is None or 'stages.identify"' not in method.read_text(encoding="utf-8")
-        words = [word for text in TINY + (TINY_LATENT if latent else []) for word in ("--set", text)]
+        text = method.read_text(encoding="utf-8") if method else ""
+        keys = [TINY_NETWORK["encoder_decoder" in text], *TINY, *([] if 'stages.identify"' in text else TINY_LATENT)]
+        words = [word for key in keys for word in ("--set", key)]
         chosen = ["--with", str(method)] if method else []
         command = [str(TRAINER), "run", str(RECIPE), "--data", str(data), "--out", str(folder / "models" / name), *chosen, *words]
         subprocess.run(command, check=True, capture_output=True, cwd=folder, timeout=120)

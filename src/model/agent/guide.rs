@@ -70,7 +70,7 @@ impl Agent {
             latents: (latent_dim > 0).then(|| gather(latent_dim, &write_latents)).transpose()?,
         };
         let Some(future) = future else { return self.judge().gradient(&seat) };
-        let (plan, told) = (&self.config().method.plan, self.config().method.told_width());
+        let told = self.config().method.told_width();
         let noise = gather(width, &|led, out| {
             let (descent, time) = (&led.row.window().descent(), led.row.window().descent().time());
             for (position, out) in out.chunks_exact_mut(width).enumerate() {
@@ -82,12 +82,11 @@ impl Agent {
             let columns = self.walk().columns.known(0, led.row.window().descent().given_len() == 0);
             out[columns].fill(1.0);
         })?;
-        let observed = || rows::observed(rows.clone().map(|led| led.row), plan.obs_horizon - 1, self.config(), self.walk());
         let tell = || rows::gather(rows.clone(), [1, told + 1], |led, out| led.row.act().write_told(true, out));
         let futures = Futures {
             noise,
             known,
-            observed: (plan.obs_horizon > 1).then(observed).transpose()?,
+            observed: rows::observed(rows.clone().map(|led| led.row), self.config(), self.walk())?,
             told: (told > 0).then(tell).transpose()?,
         };
         self.judge().gradient_in_future(&seat, &futures)

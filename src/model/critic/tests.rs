@@ -31,7 +31,7 @@ impl Network for Valued {
     fn run<V: Activations>(&self, value: &Value, inputs: &[V], rows: Range<usize>) -> Result<V> {
         let len = self.sizes.horizon;
         let levels = &self.levels[rows.start * len..rows.end * len];
-        value.predict(&inputs[0], &Given { levels, latents: inputs.get(1), observed: None, told: None })
+        value.predict(&inputs[0], &Given { latents: inputs.get(1), ..Given::levels(levels) })
     }
 }
 
@@ -54,18 +54,18 @@ fn values_against_pytorch() {
         let (golden, sizes) = (Golden::of(case), Sizes { columns: 5, latent_dim, horizon, widths });
         let levels = golden.flat("in.levels");
         golden.check_training(|given, params| {
-            let condition = Given { levels: &levels, latents: given.get("latents"), observed: None, told: None };
+            let condition = Given { latents: given.get("latents"), ..Given::levels(&levels) };
             Ok(vec![("value".into(), Value::new(sizes, LEVEL_MAX, params)?.predict(&given["x"], &condition)?)])
         });
         let (x, latents): (Buffer, Option<Buffer>) = (golden.value("in.x"), (latent_dim > 0).then(|| golden.value("in.latents")));
         golden.check_serving(|params| {
-            let condition = Given { levels: &levels, latents: latents.as_ref(), observed: None, told: None };
+            let condition = Given { latents: latents.as_ref(), ..Given::levels(&levels) };
             Ok(vec![("value".into(), Value::new(sizes, LEVEL_MAX, params)?.predict(&x, &condition)?)])
         });
         golden.check_guiding(|params| {
             let (value, given) = (Value::new(sizes, LEVEL_MAX, params)?, [latents.clone().unwrap_or_else(|| x.clone()), x.clone()]);
             let run = |[latents, x]: [Traced; 2]| {
-                value.predict(&x, &Given { levels: &levels, latents: (latent_dim > 0).then_some(&latents), observed: None, told: None })
+                value.predict(&x, &Given { latents: (latent_dim > 0).then_some(&latents), ..Given::levels(&levels) })
             };
             let (_, [to_latents, to_x]) = gradient(given, run, |_, grad| grad.copy_from_slice(&golden.flat("r.value")))?;
             let to_latents = (latent_dim > 0).then(|| ("latents".into(), to_latents));
@@ -82,7 +82,7 @@ fn wrong_sizes_are_errors() {
     let value = Value::new(sizes, LEVEL_MAX, &params).unwrap();
     let predict = |[len, columns]: [usize; 2], levels: usize, latents: Option<&Tensor>| {
         let (x, levels) = (gaussian(1, (1, len, columns)), vec![0.0; levels]);
-        value.predict(&x, &Given { levels: &levels, latents, observed: None, told: None }).map_err(|error| error.to_string())
+        value.predict(&x, &Given { latents, ..Given::levels(&levels) }).map_err(|error| error.to_string())
     };
     let latents = gaussian(2, (1, 4, 3));
     assert_eq!(predict([4, 2], 4, Some(&latents)).unwrap().dims(), [1, 1, 1]);

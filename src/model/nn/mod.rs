@@ -13,6 +13,7 @@ mod buffer;
 #[cfg(test)]
 mod candle_faults;
 pub mod conv1d;
+mod dropout;
 pub mod gru;
 pub mod host;
 pub mod kernels;
@@ -34,6 +35,7 @@ pub use absent::Absent;
 pub use activations::Activations;
 pub use buffer::Buffer;
 pub use conv1d::{Conv1d, ConvShape, ConvTranspose1d};
+pub use dropout::Chance;
 pub use gru::Gru;
 pub use kernels::{activation::Activation, product::Precision};
 pub use layer::Layer;

@@ -12,7 +12,7 @@ use crate::model::{
         schedule::Table,
     },
     latent::{Surprises, Tokens, elbo::ElboBatch},
-    method::Looks,
+    method::{Diffused, Diffusion, Looks},
     noise::Philox,
     normalizer::Affine,
     trajectory::{Layout, Seen},
@@ -162,6 +162,8 @@ pub struct BlockShape {
     pub show_action: f32,
     /// Probability that it sees the successor's reward, given that it sees the action.
     pub show_reward: f32,
+    /// Probability that it does not see the successor's state, given that it sees the action: a window of actions has none for it.
+    pub mask_state: f32,
     /// What is hidden of the history.
     pub hide: Hide,
 }
@@ -213,7 +215,8 @@ pub fn blocks(episodes: &[Episode], places: &Places, shape: &BlockShape, rng: &m
                 context.extend(row);
             }
             let ever = hidden.ever();
-            successor.extend([1.0, f32::from(action && ever.action), f32::from(reward && ever.reward)]);
+            let masked = shape.mask_state > 0.0 && action && rng.uniform() < shape.mask_state;
+            successor.extend([f32::from(!masked), f32::from(action && ever.action), f32::from(reward && ever.reward)]);
         }
     }
     let eps = (0..shape.batch * steps * shape.latent_dim).map(|_| rng.normal()).collect();
@@ -245,12 +248,10 @@ fn believed(valid: &[f32], steps: usize, rng: &mut Philox) -> Vec<f32> {
 pub struct WindowShape {
     /// Windows in a batch.
     pub batch: usize,
-    /// Positions of a window (T).
-    pub horizon: usize,
     /// How far the encoder looks back.
     pub looks: Looks,
-    /// Real steps the denoiser sees (T_o).
-    pub obs_horizon: usize,
+    /// Its plan: positions (T), the real steps that the denoiser is given (T_o), and what it diffuses.
+    pub plan: Diffusion,
     /// The rows that a sampler walks.
     pub table: Table,
     /// Which levels windows are shown at.
@@ -268,18 +269,40 @@ pub struct WindowShape {
 impl WindowShape {
     /// The last step of a window must lie in the episode.
     pub fn places(&self, episodes: &[Episode]) -> Places {
-        Places::new(episodes, 0, self.horizon)
+        Places::new(episodes, 0, self.plan.horizon)
     }
 
     /// What is seen of each of the `past` steps before the window, and of more if the denoiser looks back on more; the last one first. Of
-    /// imagined steps the sampler has its own states and actions, and never a reward.
+    /// imagined steps the sampler has its own states and actions, and never a reward; one that imagines no states has the real one of the
+    /// first of them.
     fn seen(&self, past: usize, imagined: usize, rng: &mut Philox) -> Vec<Seen> {
         let hidden = self.hide.draw(rng);
+        let policy = self.is_policy();
         let seen = |back: usize| match (hidden.step(rng), back < imagined) {
-            (_, true) => Seen::GENERATED,
+            (_, true) => Seen { state: !policy || back + 1 == imagined, ..Seen::GENERATED },
             (seen, false) => seen,
         };
-        (0..past.max(self.obs_horizon - 1)).map(seen).collect()
+        let looks_back = self.plan.obs_horizon - 1 + if policy { imagined } else { 0 };
+        (0..past.max(looks_back)).map(seen).collect()
+    }
+
+    /// Whether it imagines actions alone.
+    fn is_policy(&self) -> bool {
+        self.plan.diffused == Diffused::Action
+    }
+
+    /// The real steps that the denoiser is given with a window: [`Diffusion::observed`].
+    fn push_observed(&self, out: &mut Vec<f32>, Drawn { episode, start, imagined, seen, .. }: &Drawn) -> io::Result<()> {
+        let [steps, _] = self.plan.observed(episode.layout.widths());
+        if !self.is_policy() {
+            return (1..=steps).rev().try_for_each(|back| push_step(out, episode, start - back as isize, seen[back - 1]));
+        }
+        for back in (0..steps).rev().map(|back| back + imagined) {
+            let seen = if back == *imagined { Seen::STATE } else { seen[back - 1] };
+            push_step(out, episode, start - back as isize, seen)?;
+            out.push(self.plan.age(back));
+        }
+        Ok(())
     }
 
     /// Where a window stands, and how many imagined steps are behind it; only a window at READY can have any.
@@ -290,7 +313,7 @@ impl WindowShape {
         let below = |bound: usize| ((share * bound as f32) as usize).min(bound - 1);
         match (self.levels, self.table.ready()) {
             (Levels::Independent { level_max }, _) => {
-                (Standing::Levels((0..self.horizon).map(|_| rng.below(level_max + 1)).collect()), if at_ready { imagined } else { 0 })
+                (Standing::Levels((0..self.plan.horizon).map(|_| rng.below(level_max + 1)).collect()), if at_ready { imagined } else { 0 })
             }
             (Levels::Schedule, Some(ready)) if at_ready => (Standing::Row(ready + below(self.table.rung())), imagined),
             (Levels::Schedule, ready) => {
@@ -332,7 +355,12 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
     let mut draw = || {
         let (episode, start) = drawn(episodes, places, rng);
         let (drawn, imagined) = shape.draw_standing(rng);
-        let imagined = if row.is_some() { 0 } else { imagined };
+        let imagined = match row {
+            Some(_) => 0,
+            // Without the state that it began with an act would know of none.
+            None if shape.is_policy() => imagined.min(start.unsigned_abs()),
+            None => imagined,
+        };
         let past = match shape.looks {
             Looks::Block(len) => len,
             Looks::Running => episode.reach() + start.unsigned_abs(),
@@ -343,20 +371,18 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
     let drawn: Vec<Drawn> = (0..shape.batch).map(|_| draw()).collect();
     let layout = episodes[0].layout;
     let (mut window, mut observed) = (Vec::new(), Vec::new());
-    for Drawn { episode, start, seen, .. } in &drawn {
-        for back in (1..shape.obs_horizon).rev() {
-            push_step(&mut observed, episode, start - back as isize, seen[back - 1])?;
-        }
-        (*start..start + shape.horizon as isize).try_for_each(|t| push_step(&mut window, episode, t, Seen::ALL))?;
+    let horizon = shape.plan.horizon;
+    for one in &drawn {
+        shape.push_observed(&mut observed, one)?;
+        (one.start..one.start + horizon as isize).try_for_each(|t| push_step(&mut window, &one.episode, t, Seen::ALL))?;
     }
-    let dims = (shape.batch, shape.horizon, layout.dim());
+    let dims = (shape.batch, horizon, layout.dim());
     let noise: Vec<f32> = (0..window.len()).map(|_| rng.normal()).collect();
     let places = drawn.iter().map(|drawn| (&drawn.episode, drawn.start.unsigned_abs(), drawn.imagined));
-    let BesideBatch { told, truth, returns } = shape.beside.of(places, shape.horizon, rng)?;
-    let observed = match shape.obs_horizon {
-        0 | 1 => None,
-        real => Some(Tensor::from_vec(observed, (shape.batch, 1, (real - 1) * layout.dim()), &Device::Cpu)?),
-    };
+    let BesideBatch { told, truth, returns } = shape.beside.of(places, horizon, rng)?;
+    let chance = (shape.plan.backbone.dropout() > 0.0).then(|| u64::from(rng.bits()) << 32 | u64::from(rng.bits()));
+    let [steps, width] = shape.plan.observed(layout.widths());
+    let observed = (steps > 0).then(|| Tensor::from_vec(observed, (shape.batch, 1, steps * width), &Device::Cpu)).transpose()?;
     let pasts: Vec<_> = drawn.iter().map(|drawn| (&drawn.episode, drawn.start)).collect();
     let (history, history_lens) = histories(&pasts, shape.looks, |row, back| drawn[row].seen[back])?;
     Ok(WindowBatch {
@@ -370,6 +396,7 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
         told,
         truth,
         returns,
+        chance,
     })
 }
 

@@ -2,7 +2,10 @@
 
 use super::*;
 use crate::{
-    model::method::Schedule,
+    model::{
+        config::ModelConfig,
+        method::{Backbone, Schedule},
+    },
     train::dataset::{Sides, Span, Which},
 };
 
@@ -20,7 +23,24 @@ fn episodes() -> Vec<Episode> {
 
 /// Of eight tokens, nothing hidden.
 fn block_shape(batch: usize, looks: Looks) -> BlockShape {
-    BlockShape { batch, len: 8, looks, latent_dim: 2, stays: false, context: None, show_action: 0.5, show_reward: 0.5, hide: Hide::NOTHING }
+    BlockShape {
+        batch,
+        len: 8,
+        looks,
+        latent_dim: 2,
+        stays: false,
+        context: None,
+        show_action: 0.5,
+        show_reward: 0.5,
+        mask_state: 0.0,
+        hide: Hide::NOTHING,
+    }
+}
+
+/// Of four positions, beside so many real steps.
+fn plan(obs_horizon: usize) -> Diffusion {
+    let plan = ModelConfig::plain(LAYOUT, None, Backbone::Unet { widths: vec![8] }).method.plan;
+    Diffusion { horizon: 4, obs_horizon, ..plan }
 }
 
 fn row_of(standing: &Standing) -> usize {
@@ -73,9 +93,8 @@ fn windows_follow_their_history() {
     let episodes = episodes();
     let shape = WindowShape {
         batch: 300,
-        horizon: 4,
         looks: Looks::Block(3),
-        obs_horizon: 3,
+        plan: plan(3),
         table: Table::new(Schedule::LADDER, [0, 4], 2, 8).unwrap(),
         levels: Levels::Schedule,
         action_horizons: vec![3],
@@ -128,9 +147,8 @@ fn hidden_fields_are_hidden_from_both_networks() {
     let (episodes, hide) = (episodes(), Hide { state: 0.5, action: 0.5, reward: 0.5 });
     let shape = WindowShape {
         batch: 400,
-        horizon: 4,
         looks: Looks::Block(3),
-        obs_horizon: 3,
+        plan: plan(3),
         table: Table::new(Schedule::LADDER, [0, 4], 1, 8).unwrap(),
         levels: Levels::Schedule,
         action_horizons: vec![1, 2],
@@ -168,6 +186,7 @@ fn hidden_fields_are_hidden_from_both_networks() {
         context: None,
         show_action: 1.0,
         show_reward: 1.0,
+        mask_state: 0.0,
         hide,
     };
     let batch = blocks(&episodes, &Places::new(&episodes, 0, 8), &shape, &mut Philox::new(1)).unwrap();
@@ -187,9 +206,8 @@ fn levels_may_be_drawn_one_by_one() {
     let (episodes, uniform) = (episodes(), Table::new(Schedule::Uniform { steps: 5 }, [0, 4], 1, 8).unwrap());
     let shape = |table, levels| WindowShape {
         batch: 300,
-        horizon: 4,
         looks: Looks::Block(3),
-        obs_horizon: 1,
+        plan: plan(1),
         table,
         levels,
         action_horizons: vec![1, 2],
@@ -260,9 +278,8 @@ fn windows_cross_the_border() {
     let (episodes, table) = (vec![following()], Table::new(Schedule::LADDER, [0, 4], 1, 8).unwrap());
     let shape = WindowShape {
         batch: 400,
-        horizon: 4,
         looks: Looks::Running,
-        obs_horizon: 3,
+        plan: plan(3),
         table,
         levels: Levels::Schedule,
         action_horizons: vec![1],

@@ -123,9 +123,8 @@ pub(super) fn window_shape(task: &Task, batch: usize) -> WindowShape {
     let (plan, units) = (&method.plan, &task.config.units);
     WindowShape {
         batch,
-        horizon: plan.horizon,
         looks: task.looks(),
-        obs_horizon: plan.obs_horizon,
+        plan: plan.clone(),
         table: Table::of(plan, sampler.sub_steps).expect("the recipe was checked: is a bug"),
         levels: match loss.levels {
             TrainingLevels::Schedule => Levels::Schedule,

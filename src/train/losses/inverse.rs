@@ -90,7 +90,7 @@ impl<'a> InverseLoss<'a> {
     fn steps(&self) -> usize {
         match self.task.config.method.head {
             Head::Inverse { latent: true, .. } => 1,
-            Head::Inverse { latent: false, .. } | Head::Direct => self.shape.horizon - 1,
+            Head::Inverse { latent: false, .. } | Head::Direct => self.shape.plan.horizon - 1,
         }
     }
 

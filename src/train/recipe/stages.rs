@@ -86,7 +86,7 @@ pub struct Stage {
     pub freezes: BTreeMap<Group, f64>,
     /// As a function of the step of this stage.
     pub learning_rate: LearningRate,
-    /// Decoupled weight decay.
+    /// Decoupled weight decay, of matrices and kernels.
     pub weight_decay: f64,
     /// Largest decay of the average of the weights, which is what a checkpoint holds; absent: no average.
     pub ema_decay_max: Option<f64>,

@@ -84,7 +84,7 @@ class _Lane:
         self.broker.accept(chunk)
         self.episode.act_steps.append(len(self.episode.rewards))
         self.episode.latents.append(chunk.latent_mean)
-        if chunk.planned_states is not None:
+        if chunk.planned_states is not None and len(chunk.planned_states):
             self.episode.plans.append(chunk.planned_states)
 
     def step(self) -> None:

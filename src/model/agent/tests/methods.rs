@@ -41,6 +41,71 @@ fn plans_of_states() {
     }
 }
 
+fn of_actions(latents: bool, schedule: Schedule, backbone: Backbone) -> Agent {
+    agent_with(latents, 2, backbone, |config| {
+        config.method.plan.diffused = Diffused::Action;
+        config.method.plan.schedule = schedule;
+        if !schedule.is_ladder() {
+            config.trained.sub_steps = vec![1];
+            (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
+        }
+    })
+}
+
+/// A policy gives out actions, as bounded as they are, imagines no states, and costs what a planner does; the first action of a chunk is that
+/// of a chunk of one.
+#[test]
+fn policies_of_actions_alone() {
+    let transformer = |encoder_depth| Backbone::EncoderDecoder { width: 16, depth: 2, heads: 2, encoder_depth, dropout: 0.1 };
+    for (latents, backbone) in [(true, transformer(1)), (true, unet()), (false, transformer(0)), (false, Backbone::dit(16, 1, 2))] {
+        let agent = of_actions(latents, Schedule::LADDER, backbone.clone());
+        for (sub_steps, action_horizon) in [(1, 1), (2, 1), (1, 3), (1, 8)] {
+            let options = SamplerOptions { sub_steps, action_horizon, ..options() };
+            let chunks = run(&agent, 1, &options, 3);
+            let cold = (sub_steps * (HORIZON - 1 + action_horizon)) as u32;
+            assert_eq!((chunks[0].evaluations, chunks[0].start), (cold, Start::Cold));
+            assert_eq!((chunks[1].evaluations, chunks[1].start), ((sub_steps * action_horizon) as u32, Start::Warm));
+            for Chunk { actions, planned_states, predicted_state, .. } in &chunks {
+                assert_eq!((actions.len(), actions[0].len()), (action_horizon, 2));
+                assert!(planned_states.is_empty() && predicted_state.is_empty(), "nobody imagined a state");
+                assert!(actions.iter().flatten().all(|action| action.abs() <= 1.0));
+            }
+        }
+        let one = run(&agent, 2, &options(), 1);
+        let three = run(&agent, 2, &SamplerOptions { action_horizon: 3, ..options() }, 1);
+        assert_eq!(one[0].actions[0], three[0].actions[0]);
+        let at_once = of_actions(latents, Schedule::Uniform { steps: 5 }, backbone);
+        let options = SamplerOptions { action_horizon: 8, kappa: 0.0, streaming: false, ..options() };
+        let chunk = &run(&at_once, 1, &options, 1)[0];
+        assert_eq!((chunk.actions.len(), chunk.evaluations), (8, 5));
+    }
+}
+
+/// Nothing is dropped while serving, so a policy acts by what it is told: the state of now, and the steps before.
+#[test]
+fn policies_see_the_state_and_the_steps_before() {
+    let agent =
+        of_actions(false, Schedule::LADDER, Backbone::EncoderDecoder { width: 16, depth: 1, heads: 2, encoder_depth: 1, dropout: 0.5 });
+    let act = |first: f32, now: f32| {
+        let options = SamplerOptions { streaming: false, ..options() };
+        let (episode, _) =
+            agent.act(&agent.open(4, &options).unwrap(), &Observation { state: vec![first, 0.1, 0.2], ..Observation::default() }).unwrap();
+        agent.act(&episode, &Observation { state: vec![now, 0.1, 0.2], ..Observation::default() }).unwrap().1.actions
+    };
+    assert_eq!(act(0.5, 0.6), act(0.5, 0.6));
+    assert!(act(0.5, 0.6) != act(0.5, -0.6) && act(0.5, 0.6) != act(-0.5, 0.6));
+}
+
+/// Rows of policies do not influence each other, whatever chunks they are asked for.
+#[test]
+fn a_batch_of_policies_is_its_rows() {
+    for latents in [true, false] {
+        let backbone = Backbone::EncoderDecoder { width: 16, depth: 2, heads: 2, encoder_depth: 1, dropout: 0.1 };
+        let agent = of_actions(latents, Schedule::LADDER, backbone);
+        check_batch(&agent);
+    }
+}
+
 /// The action of a plan of states is that of the inverse dynamics, asked by hand.
 #[test]
 fn actions_lead_from_state_to_state() {
@@ -67,22 +132,23 @@ fn actions_lead_from_state_to_state() {
     }
 }
 
+/// Acts of all kinds side by side give what each gives alone.
+fn check_batch(agent: &Agent) {
+    let vary =
+        |i: u64| SamplerOptions { action_horizon: 1 + i as usize % 3, eta: (i % 2) as f32, picard_window: 1 + i as usize % 3, ..options() };
+    let mut stream = Philox::new(4);
+    let observations: Vec<Observation> = (0..6).map(|_| observation(&mut stream)).collect();
+    let episodes: Vec<Episode> = (0..6).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
+    let [alone, together] = alone_and_together(agent, &episodes, &observations);
+    assert_eq!(together, alone);
+}
+
 /// Rows of plans of states, of both kinds of inverse dynamics, do not influence each other.
 #[test]
 fn a_batch_of_states_is_its_rows() {
     for (latents, network) in [(true, Inverse::Diffusion { width: 8, steps: 3 }), (false, Inverse::Mlp { width: 8 })] {
         let agent = of_states(latents, Schedule::LADDER, network);
-        let vary = |i: u64| SamplerOptions {
-            action_horizon: 1 + i as usize % 3,
-            eta: (i % 2) as f32,
-            picard_window: 1 + i as usize % 3,
-            ..options()
-        };
-        let mut stream = Philox::new(4);
-        let observations: Vec<Observation> = (0..6).map(|_| observation(&mut stream)).collect();
-        let episodes: Vec<Episode> = (0..6).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
-        let [alone, together] = alone_and_together(&agent, &episodes, &observations);
-        assert_eq!(together, alone);
+        check_batch(&agent);
     }
 }
 
