@@ -103,6 +103,22 @@ pub enum Guide {
     },
     /// The rewards that the latent's decoder tells of the window's steps: no further network ("computed return" of the paper).
     DecoderReturn,
+    /// Critics of the first action, learned from what came of actions (implicit Q-learning, Kostrikov et al. 2022; as IDQL, Hansen-Estruch et
+    /// al. 2023, they choose among candidates and lead none).
+    Critic {
+        /// Of two hidden layers.
+        width: usize,
+    },
+}
+
+impl Guide {
+    /// Whether its gradient leads a window on its way down.
+    pub fn leads(&self) -> bool {
+        match self {
+            Self::Value { .. } | Self::DecoderReturn => true,
+            Self::Critic { .. } => false,
+        }
+    }
 }
 
 /// What a session may tell.
@@ -138,6 +154,9 @@ pub struct Diffusion {
     pub obs_horizon: usize,
     /// Number of diffusion levels (K).
     pub level_max: usize,
+    /// How much of a signal each level leaves.
+    #[serde(default, skip_serializing_if = "AlphaBar::is_cosine")]
+    pub alpha: AlphaBar,
     /// What a window is made of.
     #[serde(default, skip_serializing_if = "Diffused::is_state_action")]
     pub diffused: Diffused,
@@ -151,6 +170,23 @@ pub struct Diffusion {
     pub backbone: Backbone,
     /// Bound of denoised states, in standard deviations of the data.
     pub clip: f32,
+}
+
+/// The share of the signal's variance that is left at each level.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AlphaBar {
+    /// A squared cosine (Nichol and Dhariwal 2021).
+    #[default]
+    Cosine,
+    /// The variance-preserving process with betas from 0.1 to 10 (Song et al. 2021), for few levels.
+    VpLinear,
+}
+
+impl AlphaBar {
+    fn is_cosine(&self) -> bool {
+        *self == Self::Cosine
+    }
 }
 
 /// What a position of a window is made of.
@@ -291,6 +327,15 @@ pub enum Backbone {
         /// Share of numbers that are zeroed by chance in training (Srivastava et al. 2014).
         dropout: f32,
     },
+    /// Residual blocks over the whole window as one vector (IDQL, Hansen-Estruch et al. 2023) with the same skip, for windows of few numbers.
+    Mlp {
+        /// Width of the residual stream; blocks are four times as wide.
+        width: usize,
+        /// Number of blocks.
+        depth: usize,
+        /// Share of numbers that are zeroed by chance in training.
+        dropout: f32,
+    },
 }
 
 /// How a transformer is told the real steps before a window.
@@ -326,6 +371,11 @@ impl Method {
         matches!(self.guide, Some(Guide::Value { .. }))
     }
 
+    /// Whether its guide is a critic.
+    pub fn has_critic(&self) -> bool {
+        matches!(self.guide, Some(Guide::Critic { .. }))
+    }
+
     /// Whether anything of it needs the return of a step.
     pub fn asks_for_returns(&self) -> bool {
         self.guide.is_some() || self.told.contains(&Told::Return)
@@ -343,7 +393,7 @@ impl Backbone {
     pub fn dropout(&self) -> f32 {
         match self {
             Self::Unet { .. } | Self::Dit { .. } => 0.0,
-            Self::EncoderDecoder { dropout, .. } => *dropout,
+            Self::EncoderDecoder { dropout, .. } | Self::Mlp { dropout, .. } => *dropout,
         }
     }
 

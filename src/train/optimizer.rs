@@ -248,11 +248,19 @@ impl Ema {
     /// # Errors
     /// If a tensor operation fails.
     pub fn tensors(&self, vars: &BTreeMap<String, Var>) -> Result<BTreeMap<String, Tensor>> {
+        self.tensors_of("", vars)
+    }
+
+    /// Of the variables whose names begin so.
+    ///
+    /// # Errors
+    /// As of [`Self::tensors`].
+    pub fn tensors_of(&self, prefix: &str, vars: &BTreeMap<String, Var>) -> Result<BTreeMap<String, Tensor>> {
         let tensor = |(name, values): (&String, &Vec<f32>)| {
             let var = &vars[name];
             Ok((name.clone(), Tensor::from_slice(values, var.shape(), var.device())?))
         };
-        self.values.iter().map(tensor).collect()
+        self.values.iter().filter(|(name, _)| name.starts_with(prefix)).map(tensor).collect()
     }
 
     /// Takes the average from the training state: `ema.NAME`.

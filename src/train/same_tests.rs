@@ -84,7 +84,7 @@ fn episodes(before: usize) -> Vec<Episode> {
     let mut numbers = |count: usize, scale: f32| (0..count).map(|_| scale * (2.0 * rng.uniform() - 1.0)).collect::<Vec<f32>>();
     let mut episode = || {
         let columns = [numbers(all * 3, 2.0), numbers(all * 2, 1.0), numbers(all, 1.0), numbers(all * 2, 1.0)];
-        Episode::among(LAYOUT, columns, Span { rows: before..all, play: false, before: (before > 0).then_some(0..before) })
+        Episode::among(LAYOUT, columns, Span { rows: before..all, play: false, ended: false, before: (before > 0).then_some(0..before) })
     };
     (0..3).map(|_| episode()).collect()
 }

@@ -2,6 +2,7 @@
 //! because the losses that touch the latents are x0 losses, and a rung of the ladder spans many levels).
 mod dit;
 mod encoder_decoder;
+mod residual;
 mod unet;
 
 use crate::model::{
@@ -14,6 +15,7 @@ use crate::model::{
 use candle_core::Result;
 use dit::Dit;
 use encoder_decoder::EncoderDecoder;
+use residual::Residual;
 use unet::Unet;
 
 pub use crate::model::temporal::Given;
@@ -52,9 +54,18 @@ pub(in crate::model) fn check(plan: &Diffusion) -> std::result::Result<(), Unfit
             }
             let divides = *heads >= 1 && width.is_multiple_of(*heads);
             require(divides, field("heads"), format!("is {heads}, must divide the width {width}"))?;
-            require((0.0..1.0).contains(dropout), field("dropout"), format!("is {dropout}, must lie in 0..1"))
+            check_dropout(&field, *dropout)
+        }
+        Backbone::Mlp { width, depth, dropout } => {
+            size(&field("width"), *width, WIDTH_MAX)?;
+            require(*depth <= dit::DEPTH_MAX, field("depth"), format!("is {depth}, must lie in 0..={}", dit::DEPTH_MAX))?;
+            check_dropout(&field, *dropout)
         }
     }
+}
+
+fn check_dropout(field: &impl Fn(&str) -> String, share: f32) -> std::result::Result<(), Unfit> {
+    require((0.0..1.0).contains(&share), field("dropout"), format!("is {share}, must lie in 0..1"))
 }
 
 /// A width of tokens, which sinusoids fill in pairs.
@@ -67,6 +78,7 @@ enum Net {
     Unet(Box<Unet>),
     Dit(Box<Dit>),
     EncoderDecoder(Box<EncoderDecoder>),
+    Mlp(Box<Residual>),
 }
 
 /// What a backbone is given: the input channels of each position, their levels, and a vector for the whole window.
@@ -106,7 +118,7 @@ impl Denoiser {
         let ([real_steps, step], told) = (method.plan.observed(layout.widths()), method.told_width());
         let tokens = match backbone {
             Backbone::Dit { history: History::Tokens, .. } | Backbone::EncoderDecoder { .. } => real_steps,
-            Backbone::Unet { .. } | Backbone::Dit { history: History::Vector, .. } => 0,
+            Backbone::Unet { .. } | Backbone::Dit { history: History::Vector, .. } | Backbone::Mlp { .. } => 0,
         };
         let (net, emb) = match backbone {
             Backbone::Unet { widths } => (Net::Unet(Box::new(Unet::new(d_in, columns, widths, params)?)), EMB),
@@ -128,6 +140,10 @@ impl Denoiser {
                     level_max: *level_max,
                 };
                 (Net::EncoderDecoder(Box::new(EncoderDecoder::new(&sizes, params)?)), *width)
+            }
+            Backbone::Mlp { width, depth, dropout } => {
+                let net = Residual::new([d_in, columns, *horizon], [*width, *depth, *level_max], *dropout, params)?;
+                (Net::Mlp(Box::new(net)), *width)
             }
         };
         let embedding = |name: &str, width: usize| -> Result<Option<[Linear; 2]>> {
@@ -163,6 +179,7 @@ impl Denoiser {
             Net::Unet(net) => net.forward(&inputs)?,
             Net::Dit(net) => net.forward(&inputs)?,
             Net::EncoderDecoder(net) => net.forward(&inputs)?,
+            Net::Mlp(net) => net.forward(&inputs)?,
         };
         out.plus(&self.input_skip.forward(&x)?)
     }

@@ -332,7 +332,7 @@ fn window_tokens(
 impl Noised {
     fn new(plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<Self> {
         let table = Table::of(plan, options.sub_steps).map_err(candle_core::Error::Msg)?;
-        let (process, columns) = (Process::cosine(plan.level_max), Columns::new(plan.diffused, batch.layout()?));
+        let (process, columns) = (Process::new(plan.alpha, plan.level_max), Columns::new(plan.diffused, batch.layout()?));
         // Rows below READY; none for a window above it.
         let below_ready = |standing: &Standing| match (standing, table.ready()) {
             (Standing::Row(row), Some(ready)) => row.checked_sub(ready),

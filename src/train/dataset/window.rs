@@ -305,6 +305,16 @@ impl WindowShape {
         Ok(())
     }
 
+    /// The window at a place of an episode, with what is seen of the steps before it.
+    fn at(&self, (episode, start): (Episode, isize), (standing, imagined): (Standing, usize), rng: &mut Philox) -> Drawn {
+        let past = match self.looks {
+            Looks::Block(len) => len,
+            Looks::Running => episode.reach() + start.unsigned_abs(),
+        };
+        let seen = self.seen(past, imagined, rng);
+        Drawn { episode, start, standing, imagined, seen }
+    }
+
     /// Where a window stands, and how many imagined steps are behind it; only a window at READY can have any.
     fn draw_standing(&self, rng: &mut Philox) -> (Standing, usize) {
         let at_ready = rng.uniform() < self.ready_fraction;
@@ -361,18 +371,53 @@ pub fn windows(episodes: &[Episode], places: &Places, shape: &WindowShape, row: 
             None if shape.is_policy() => imagined.min(start.unsigned_abs()),
             None => imagined,
         };
-        let past = match shape.looks {
-            Looks::Block(len) => len,
-            Looks::Running => episode.reach() + start.unsigned_abs(),
-        };
-        let seen = shape.seen(past, imagined, rng);
-        Drawn { episode, start, standing: row.map_or(drawn, Standing::Row), imagined, seen }
+        shape.at((episode, start), (row.map_or(drawn, Standing::Row), imagined), rng)
     };
     let drawn: Vec<Drawn> = (0..shape.batch).map(|_| draw()).collect();
-    let layout = episodes[0].layout;
+    cut(&drawn, shape, rng)
+}
+
+/// Transitions, as the windows that an act has at their step and at the one after it, and what came of it.
+pub struct TransitionBatch {
+    /// At the step; of one position.
+    pub now: WindowBatch,
+    /// At the next one; where the episode ended, that of the step again.
+    pub next: WindowBatch,
+    /// Rewards, as episodes hold them.
+    pub rewards: Vec<f32>,
+    /// Whether the episode ended with the step, by what happened.
+    pub ended: Vec<bool>,
+}
+
+/// Where a transition may begin: at each step but the last, and at that one too where something ended the episode.
+pub fn transition_places(episodes: &[Episode]) -> Places {
+    Places::counted(episodes.iter().map(|episode| (0, episode.len() - usize::from(!episode.ended))))
+}
+
+/// Draws a batch of transitions; `shape` is that of windows of one position.
+///
+/// # Errors
+/// If an episode cannot be read.
+pub fn transitions(episodes: &[Episode], places: &Places, shape: &WindowShape, rng: &mut Philox) -> Result<TransitionBatch> {
+    let (mut now, mut next, mut rewards, mut ended) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let top = || (Standing::Row(0), 0);
+    for _ in 0..shape.batch {
+        let (episode, start) = drawn(episodes, places, rng);
+        let last = start.unsigned_abs() + 1 == episode.len();
+        rewards.push(episode.reward(start.unsigned_abs())?);
+        ended.push(last);
+        next.push(shape.at((episode.clone(), if last { start } else { start + 1 }), top(), rng));
+        now.push(shape.at((episode, start), top(), rng));
+    }
+    Ok(TransitionBatch { now: cut(&now, shape, rng)?, next: cut(&next, shape, rng)?, rewards, ended })
+}
+
+/// Cuts windows from their episodes.
+fn cut(drawn: &[Drawn], shape: &WindowShape, rng: &mut Philox) -> Result<WindowBatch> {
+    let layout = drawn[0].episode.layout;
     let (mut window, mut observed) = (Vec::new(), Vec::new());
     let horizon = shape.plan.horizon;
-    for one in &drawn {
+    for one in drawn {
         shape.push_observed(&mut observed, one)?;
         (one.start..one.start + horizon as isize).try_for_each(|t| push_step(&mut window, &one.episode, t, Seen::ALL))?;
     }

@@ -234,7 +234,7 @@ fn following() -> Episode {
 
 fn following_as(play: bool) -> Episode {
     let states = (0..17).flat_map(|row| if row < 5 { [row as f32, 0.0] } else { [(95 + row) as f32, 0.0] }).collect();
-    Episode::among(LAYOUT, [states, vec![0.5; 17], vec![0.25; 17], Vec::new()], Span { rows: 5..17, play, before: Some(0..4) })
+    Episode::among(LAYOUT, [states, vec![0.5; 17], vec![0.25; 17], Vec::new()], Span { rows: 5..17, play, ended: false, before: Some(0..4) })
 }
 
 #[test]

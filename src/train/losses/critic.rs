@@ -1,0 +1,132 @@
+//! The errors of critics on drawn transitions (implicit Q-learning, Kostrikov et al. 2022), with latents as an act has them. The slow copy that they
+//! are drawn to is the average of the stage, which is what a checkpoint holds.
+
+use super::{
+    Job, Mean, Part,
+    denoise::{refine_options, window_shape},
+};
+use crate::model::{
+    Networks,
+    critic::{Critic, CriticTerms, Transitions},
+    diffusion::refine::{RefineOptions, WindowBatch},
+    method::Diffusion,
+    noise::Philox,
+};
+use crate::train::{
+    Task,
+    dataset::{
+        HELD_OUT_SEED, Sides,
+        hidden::Hide,
+        window::{Places, TransitionBatch, WindowShape, transition_places, transitions},
+    },
+    recipe::losses::{CriticConfig, Loss},
+};
+use anyhow::{Context, Result};
+use candle_core::{Device, Tensor};
+
+/// Held-out transitions.
+const HELD_OUT_TRANSITIONS: usize = 1024;
+
+/// Draws transitions and evaluates the loss. Play is drawn too: it shows what comes of actions.
+pub struct CriticLoss<'a> {
+    task: &'a Task,
+    config: &'a CriticConfig,
+    /// In the sum that the stage minimizes.
+    weight: f64,
+    shape: WindowShape,
+    episodes: Sides,
+    places: Places,
+    options: RefineOptions,
+}
+
+impl<'a> CriticLoss<'a> {
+    /// As the stage with this index has it; none where it does not.
+    pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
+        let weight = task.recipe.stages.get(stage)?.weight(Loss::Critic);
+        let config = task.recipe.losses.critic.as_ref().filter(|_| weight > 0.0)?;
+        let shape = window_shape(task, config.batch);
+        let shape = WindowShape { plan: Diffusion { horizon: 1, ..shape.plan.clone() }, ..shape };
+        let episodes = task.split.episodes.clone();
+        Some(Self { task, config, weight, places: transition_places(&episodes.train), shape, episodes, options: refine_options(task, false) })
+    }
+
+    /// Draws from these episodes, which are the task's own and may tell more.
+    pub(super) fn look_at(&mut self, episodes: &Sides) {
+        self.episodes = episodes.clone();
+    }
+
+    /// Draws the batch of a step; `target` is the slow copy.
+    ///
+    /// # Errors
+    /// If an episode cannot be read.
+    pub(super) fn job<'b>(&'b self, networks: &'b Networks, target: &'b Critic, rng: &mut Philox) -> Result<Job<'b>> {
+        let batch = transitions(&self.episodes.train, &self.places, &self.shape, rng)?;
+        Ok(Box::new(move || {
+            let CriticTerms { loss, q, v } = self.errors(networks, target, &batch)?;
+            let mean = |name, error: &Tensor| Ok::<_, anyhow::Error>(Mean { name, sum: f64::from(error.to_scalar::<f32>()?), count: 1 });
+            let means = vec![mean("q", &q)?, mean("v", &v)?];
+            Ok(Part { grads: loss.affine(self.weight, 0.0)?.backward()?, means })
+        }))
+    }
+
+    /// The sum of both errors on held-out transitions, by the critics alone.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn held_out(&self, networks: &Networks) -> Result<f64> {
+        let shape = WindowShape { batch: HELD_OUT_TRANSITIONS, hide: Hide::NOTHING, ..self.shape.clone() };
+        let episodes = &self.episodes.held_out;
+        let batch = transitions(episodes, &transition_places(episodes), &shape, &mut Philox::new(HELD_OUT_SEED))?;
+        let critic = networks.critic.as_ref().context(NO_CRITIC)?;
+        Ok(f64::from(self.errors(networks, critic, &batch)?.loss.to_scalar::<f32>()?))
+    }
+
+    fn errors(&self, networks: &Networks, target: &Critic, batch: &TransitionBatch) -> Result<CriticTerms> {
+        let critic = networks.critic.as_ref().context(NO_CRITIC)?;
+        let layout = self.task.config.layout;
+        let latent = |windows: &WindowBatch| networks.latents_of(&self.shape.plan, windows, &self.options);
+        let part = |windows: &WindowBatch, start, len| windows.window.narrow(2, start, len)?.contiguous();
+        let column = |values: Vec<f32>| Tensor::from_vec(values, (batch.rewards.len(), 1, 1), &Device::Cpu);
+        let worth = Worth::of(self.task);
+        let discount = f64::from(self.task.config.method.discount);
+        let latents = [latent(&batch.now)?, latent(&batch.next)?];
+        let of = Transitions {
+            state: &part(&batch.now, 0, layout.state_dim)?,
+            action: &part(&batch.now, layout.state_dim, layout.action_dim)?,
+            latent: latents[0].as_ref(),
+            next_state: &part(&batch.next, 0, layout.state_dim)?,
+            next_latent: latents[1].as_ref(),
+            reward: &column(batch.rewards.iter().map(|reward| ((1.0 - discount) * worth.of_reward(*reward)) as f32).collect())?,
+            end_worth: worth.of_raw(0.0),
+            ended: &column(batch.ended.iter().map(|ended| f32::from(*ended)).collect())?,
+        };
+        Ok(critic.errors(target, &of, (discount, self.config.expectile))?)
+    }
+}
+
+const NO_CRITIC: &str = "a model without critics has no error of them: is a bug";
+
+/// From rewards to what having them for ever is worth, standard deviations of the data's returns.
+struct Worth {
+    reward: [f64; 2],
+    returns: [f64; 2],
+}
+
+impl Worth {
+    fn of(task: &Task) -> Self {
+        let units = &task.config.units;
+        let reward = &units.normalizer.reward;
+        let returns = units.returns.as_ref().map_or([0.0, 1.0], |returns| [returns.mean[0], returns.std[0]]);
+        Self { reward: [reward.mean[0], reward.std[0]].map(f64::from), returns: returns.map(f64::from) }
+    }
+
+    /// Of a reward as episodes hold it.
+    fn of_reward(&self, reward: f32) -> f64 {
+        self.of_raw(self.reward[0] + self.reward[1] * f64::from(reward))
+    }
+
+    /// Of one in units of the data: after an end there is none, which is 0.
+    fn of_raw(&self, reward: f64) -> f64 {
+        (reward - self.returns[0]) / self.returns[1]
+    }
+}
