@@ -20,9 +20,11 @@ from ada_diffuser.rollout import Trial, evaluate
 TRAINER = Path(os.environ.get("ADA_TRAINER", ROOT / "target/release/ada-trainer"))
 RECIPE = ROOT / "models/point-wind-s/recipe.toml"
 METHODS = sorted((ROOT / "models/methods").glob("*.toml"))
-TINY_NETWORK = {
-    False: 'model.plan.backbone={kind="dit",width=16,depth=1,heads=2}',
-    True: 'model.plan.backbone={kind="encoder_decoder",width=16,depth=1,heads=2,encoder_depth=1,dropout=0.1}',
+#: By the kind that a method asks for, if it does.
+TINY_NETWORKS = {
+    "encoder_decoder": 'model.plan.backbone={kind="encoder_decoder",width=16,depth=1,heads=2,encoder_depth=1,dropout=0.1}',
+    "mlp": 'model.plan.backbone={kind="mlp",width=16,depth=1,dropout=0.1}',
+    "": 'model.plan.backbone={kind="dit",width=16,depth=1,heads=2}',
 }
 TINY = [
     "losses.denoise.batch=4",
@@ -42,7 +44,8 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for method in [None, *METHODS]:
         name = method.stem if method else "plain"
         text = method.read_text(encoding="utf-8") if method else ""
-        keys = [TINY_NETWORK["encoder_decoder" in text], *TINY, *([] if 'stages.identify"' in text else TINY_LATENT)]
+        network = next(network for kind, network in TINY_NETWORKS.items() if f'backbone" = {{ kind = "{kind}' in text or not kind)
+        keys = [network, *TINY, *([] if 'stages.identify"' in text else TINY_LATENT)]
         words = [word for key in keys for word in ("--set", key)]
         chosen = ["--with", str(method)] if method else []
         command = [str(TRAINER), "run", str(RECIPE), "--data", str(data), "--out", str(folder / "models" / name), *chosen, *words]

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::model::{
-    config::Restart,
+    config::{Restart, Units},
     method::Schedule,
     method::{Backbone, Future, GruLatent, Looks},
     nn::params::Params,

@@ -5,6 +5,7 @@ use crate::model::{
     golden::Golden,
     gradients::{Network, check},
     nn::{Activations, Buffer, Params, Traced, gradient, testing::gaussian},
+    trajectory::Layout,
 };
 use candle_core::{Result, Tensor};
 use std::ops::Range;
@@ -105,4 +106,42 @@ fn widths_that_do_not_fit_are_named() {
     assert_eq!(reason(&[8, 8], 1), field("the horizon 1 cannot be halved 1 times, once between two widths"));
     assert_eq!(reason(&[8; 4], 4), field("the horizon 4 cannot be halved 3 times, once between two widths"));
     assert_eq!(reason(&[8; 4], 0), field("the horizon 0 cannot be halved 3 times, once between two widths"));
+}
+
+/// Both critics of an action and that of the state, the errors and their gradients, with latents.
+#[test]
+fn critics_against_pytorch() {
+    let (golden, layout) = (Golden::of("critic"), Layout { state_dim: 3, action_dim: 2 });
+    golden.check_training(|given, params| {
+        let critic = Critic::new(layout, 4, 7, params)?;
+        let of = Transitions {
+            state: &given["state"],
+            action: &given["action"],
+            latent: given.get("latents"),
+            next_state: &given["next_state"],
+            next_latent: given.get("next_latents"),
+            reward: &given["gain"],
+            end_worth: -0.4,
+            ended: &given["ended"],
+        };
+        let [q1, q2] = critic.q(of.state, of.action, of.latent)?;
+        let v = critic.v(of.state, of.latent)?;
+        let CriticTerms { loss, q, v: of_v } = critic.errors(&critic, &of, (0.9, 0.7))?;
+        let named = [("q1", q1), ("q2", q2), ("v", v), ("loss", loss), ("loss_q", q), ("loss_v", of_v)];
+        Ok(named.map(|(name, value)| (name.to_owned(), value)).into())
+    });
+}
+
+/// What V is drawn to: of a fair coin's 0 and 1 the expectile tau is tau itself, where the error has no slope.
+#[test]
+fn an_expectile_is_where_the_error_is_flat() {
+    let coin = Tensor::new(&[0.0_f32, 1.0], &candle_core::Device::Cpu).unwrap().reshape((2, 1, 1)).unwrap();
+    for tau in [0.5, 0.7, 0.9] {
+        let slope = |v: f64| {
+            let v = candle_core::Var::from_tensor(&Tensor::full(v as f32, (2, 1, 1), &candle_core::Device::Cpu).unwrap()).unwrap();
+            let error = twin::expectile_error(&(&coin - v.as_tensor()).unwrap(), tau).unwrap();
+            error.backward().unwrap().get(&v).unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap()
+        };
+        assert!(slope(tau).abs() < 1e-6 && slope(tau - 0.05) < -1e-3 && slope(tau + 0.05) > 1e-3, "{tau}");
+    }
 }

@@ -101,7 +101,7 @@ impl Critic {
 }
 
 /// Mean of `|tau - 1(u < 0)| u^2`.
-fn expectile_error(u: &Tensor, tau: f64) -> Result<Tensor> {
+pub(super) fn expectile_error(u: &Tensor, tau: f64) -> Result<Tensor> {
     let below = u.lt(0.0)?.to_dtype(u.dtype())?.detach();
     // tau where u >= 0, 1 - tau where it is below.
     let weight = below.affine(1.0 - 2.0 * tau, tau)?;

@@ -1,12 +1,7 @@
 //! Residual blocks over the whole window as one vector (`MLPResNet` of IDQL, Hansen-Estruch et al. 2023), for windows of few numbers.
 
 use super::Inputs;
-use crate::model::nn::{
-    Activation::Mish,
-    Activations, LayerNorm, Linear,
-    params::Params,
-    time_embedding::Sinusoid,
-};
+use crate::model::nn::{Activation::Mish, Activations, LayerNorm, Linear, params::Params, time_embedding::Sinusoid};
 use candle_core::Result;
 
 const EPS: f64 = 1e-6;
@@ -43,10 +38,7 @@ impl Residual {
         };
         Ok(Self {
             sinusoid: Sinusoid::new(LEVEL, level_max)?,
-            time: [
-                Linear::new(LEVEL, LEVEL_HIDDEN, &params.scope("time.0"))?,
-                Linear::new(LEVEL_HIDDEN, width, &params.scope("time.2"))?,
-            ],
+            time: [Linear::new(LEVEL, LEVEL_HIDDEN, &params.scope("time.0"))?, Linear::new(LEVEL_HIDDEN, width, &params.scope("time.2"))?],
             input: Linear::new(horizon * d_in, width, &params.scope("input"))?,
             blocks: (0..depth).map(|i| block(params.scope("blocks").scope(i))).collect::<Result<_>>()?,
             out: Linear::new(width, horizon * d_out, &params.scope("out"))?,

@@ -26,8 +26,10 @@ fn config(backbone: Backbone) -> ModelConfig {
     config
 }
 
-fn backbones() -> [Backbone; 4] {
-    [Backbone::Unet { widths: vec![24, 40, 72] }, Backbone::dit(36, 2, 3), with_tokens(36, 2, 3), encoder_decoder([36, 3], [1, 2])]
+fn backbones() -> [Backbone; 5] {
+    let unet = Backbone::Unet { widths: vec![24, 40, 72] };
+    let mlp = Backbone::Mlp { width: 20, depth: 2, dropout: 0.3 };
+    [unet, Backbone::dit(36, 2, 3), with_tokens(36, 2, 3), encoder_decoder([36, 3], [1, 2]), mlp]
 }
 
 /// Width and heads, blocks of encoder and decoder.
@@ -207,6 +209,27 @@ fn policies_against_pytorch() {
             let value = |(name, has): (&str, bool)| has.then(|| golden.value::<Buffer>(&format!("in.{name}")));
             let [latents, observed, told] = [("latents", has[0]), ("observed", has[1]), ("told", has[2])].map(value);
             let condition = Given { latents: latents.as_ref(), observed: observed.as_ref(), told: told.as_ref(), ..Given::levels(&levels) };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &method, params)?.predict(&golden.value("in.x"), &condition)?)])
+        });
+    }
+}
+
+/// Actors of residual blocks: one action with a latent, and three without.
+#[test]
+fn actors_against_pytorch() {
+    for (case, horizon, steps, latent, width) in [("actor", 1, 2, 4, 12), ("actor_plain", 3, 1, 0, 7)] {
+        let (golden, latents) = (Golden::of(case), (latent > 0).then_some(GruLatent::plain(latent, 8, Looks::Block(4))));
+        let mut method = ModelConfig::plain(LAYOUT, latents, Backbone::Mlp { width, depth: 2, dropout: 0.1 }).method;
+        (method.plan.horizon, method.plan.obs_horizon, method.plan.diffused) = (horizon, steps, Diffused::Action);
+        let levels = golden.flat("in.levels");
+        golden.check_training(|given, params| {
+            let condition = Given { latents: given.get("latents"), observed: given.get("observed"), ..Given::levels(&levels) };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &method, params)?.predict(&given["x"], &condition)?)])
+        });
+        golden.check_serving(|params| {
+            let latents: Option<Buffer> = (latent > 0).then(|| golden.value("in.latents"));
+            let observed: Buffer = golden.value("in.observed");
+            let condition = Given { latents: latents.as_ref(), observed: Some(&observed), ..Given::levels(&levels) };
             Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &method, params)?.predict(&golden.value("in.x"), &condition)?)])
         });
     }

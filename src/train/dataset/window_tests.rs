@@ -234,7 +234,11 @@ fn following() -> Episode {
 
 fn following_as(play: bool) -> Episode {
     let states = (0..17).flat_map(|row| if row < 5 { [row as f32, 0.0] } else { [(95 + row) as f32, 0.0] }).collect();
-    Episode::among(LAYOUT, [states, vec![0.5; 17], vec![0.25; 17], Vec::new()], Span { rows: 5..17, play, ended: false, before: Some(0..4) })
+    Episode::among(
+        LAYOUT,
+        [states, vec![0.5; 17], vec![0.25; 17], Vec::new()],
+        Span { rows: 5..17, play, ended: false, before: Some(0..4) },
+    )
 }
 
 #[test]
@@ -320,4 +324,42 @@ fn play_is_told_from_demonstrations() {
     let sides = Sides { train: [true, false, true].map(following_as).to_vec(), held_out: vec![following_as(false)] };
     let count = |which| (sides.only(which).train.len(), sides.only(which).held_out.len());
     assert_eq!([Which::All, Which::Play, Which::Demonstrations].map(count), [(3, 1), (2, 0), (1, 1)]);
+}
+
+/// Each step but the last of an episode, and that one too where something ended it; the next window is that of the step after, whose history has
+/// the step itself, or where there is none, the same again.
+#[test]
+fn transitions_follow_one_another() {
+    let whole = episodes();
+    let mut ending = whole[1].clone();
+    ending.ended = true;
+    let episodes = vec![whole[0].clone(), ending];
+    let shape = WindowShape {
+        batch: 400,
+        looks: Looks::Block(3),
+        plan: Diffusion { horizon: 1, diffused: Diffused::Action, ..plan(1) },
+        table: Table::new(Schedule::Uniform { steps: 5 }, [0, 1], 1, 8).unwrap(),
+        levels: Levels::Schedule,
+        action_horizons: vec![1],
+        ready_fraction: 0.0,
+        hide: Hide::NOTHING,
+        beside: Beside::default(),
+    };
+    let batch = transitions(&episodes, &transition_places(&episodes), &shape, &mut Philox::new(2)).unwrap();
+    let [now, next] = [&batch.now, &batch.next].map(|windows| rows(&windows.window));
+    let last = |windows: &WindowBatch| rows(&windows.history.state).into_iter().map(|row| row[2][0]).collect::<Vec<_>>();
+    let (before_now, before_next) = (last(&batch.now), last(&batch.next));
+    let mut seen = std::collections::BTreeSet::new();
+    for row in 0..400 {
+        let (state, later) = (now[row][0][0], next[row][0][0]);
+        seen.insert(state as usize);
+        assert_eq!(batch.rewards[row], -(state % 100.0));
+        assert_eq!(batch.ended[row], state == 211.0);
+        if batch.ended[row] {
+            assert_eq!((later, before_next[row]), (state, before_now[row]));
+        } else {
+            assert_eq!((later, before_next[row]), (state + 1.0, state));
+        }
+    }
+    assert_eq!(seen, (100..108).chain(200..212).collect());
 }

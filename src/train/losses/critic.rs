@@ -47,7 +47,15 @@ impl<'a> CriticLoss<'a> {
         let shape = window_shape(task, config.batch);
         let shape = WindowShape { plan: Diffusion { horizon: 1, ..shape.plan.clone() }, ..shape };
         let episodes = task.split.episodes.clone();
-        Some(Self { task, config, weight, places: transition_places(&episodes.train), shape, episodes, options: refine_options(task, false) })
+        Some(Self {
+            task,
+            config,
+            weight,
+            places: transition_places(&episodes.train),
+            shape,
+            episodes,
+            options: refine_options(task, false),
+        })
     }
 
     /// Draws from these episodes, which are the task's own and may tell more.
@@ -128,5 +136,77 @@ impl Worth {
     /// Of one in units of the data: after an end there is none, which is 0.
     fn of_raw(&self, reward: f64) -> f64 {
         (reward - self.returns[0]) / self.returns[1]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::model::{
+        critic::{Critic, Transitions},
+        nn::params::Params,
+        trajectory::Layout,
+    };
+    use crate::train::optimizer::{Adam, Ema};
+    use candle_core::{Device, Tensor};
+
+    const DISCOUNT: f64 = 0.8;
+    const TAU: f64 = 0.75;
+    const END: f64 = -0.5;
+
+    fn column(values: &[f32], width: usize) -> Tensor {
+        Tensor::from_slice(values, (values.len() / width, 1, width), &Device::Cpu).unwrap()
+    }
+
+    /// A world of two states and two actions whose worths can be written down: in state 0 to stay pays .5 and to go pays nothing; in state 1 to
+    /// go back pays nothing, and to go on pays 1 and ends. V is `tau` of the better action and the rest of the other, Q is the reward and V
+    /// of what comes, found by going round.
+    fn expected() -> ([[f64; 2]; 2], [f64; 2]) {
+        let mut q = [[0.0_f64; 2]; 2];
+        for _ in 0..500 {
+            let v = q.map(|[a, b]| TAU * a.max(b) + (1.0 - TAU) * a.min(b));
+            q = [[0.5 + DISCOUNT * v[0], DISCOUNT * v[1]], [DISCOUNT * v[0], 1.0 + DISCOUNT * END]];
+        }
+        (q, q.map(|[a, b]| TAU * a.max(b) + (1.0 - TAU) * a.min(b)))
+    }
+
+    /// Critics that learn from all four transitions, each as often, with the average of their weights as the slow copy, find those worths.
+    #[test]
+    fn critics_of_a_small_world_find_its_worths() {
+        let layout = Layout { state_dim: 2, action_dim: 1 };
+        let params = Params::fresh(3);
+        let critic = Critic::new(layout, 0, 24, &params).unwrap();
+        let vars = params.vars();
+        let (mut adam, mut ema) = (Adam::new(&vars, |_| Some(0), 0.0, f64::INFINITY), Ema::new(&vars, 0.98).unwrap());
+        let (zero, one) = ([1.0, 0.0], [0.0, 1.0]);
+        let state = column(&[zero, zero, one, one].concat(), 2);
+        let next_state = column(&[zero, one, zero, one].concat(), 2);
+        let action = column(&[-1.0, 1.0, -1.0, 1.0], 1);
+        let (reward, ended) = (column(&[0.5, 0.0, 0.0, 1.0], 1), column(&[0.0, 0.0, 0.0, 1.0], 1));
+        let of = Transitions {
+            state: &state,
+            action: &action,
+            latent: None,
+            next_state: &next_state,
+            next_latent: None,
+            reward: &reward,
+            end_worth: END,
+            ended: &ended,
+        };
+        for step in 0..2500 {
+            let slow = Critic::new(layout, 0, 24, &Params::loaded(ema.tensors(&vars).unwrap())).unwrap();
+            let loss = critic.errors(&slow, &of, (DISCOUNT, TAU)).unwrap().loss;
+            adam.step(&[loss.backward().unwrap()], &[3e-3]).unwrap();
+            ema.update(&vars, step).unwrap();
+        }
+        let numbers = |tensor: Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let (q, v) = expected();
+        for found in critic.q(&state, &action, None).unwrap() {
+            for (found, expected) in numbers(found).into_iter().zip(q.as_flattened()) {
+                assert!((f64::from(found) - expected).abs() < 0.02, "{found} {expected}");
+            }
+        }
+        for (found, expected) in numbers(critic.v(&state, None).unwrap()).into_iter().zip([v[0], v[0], v[1], v[1]]) {
+            assert!((f64::from(found) - expected).abs() < 0.02, "{found} {expected}");
+        }
     }
 }

@@ -80,7 +80,8 @@ impl<'a> Objective<'a> {
     pub fn prepared(mut self, networks: &Networks) -> Result<Self> {
         let baseline = networks.latent.as_ref().and_then(|latent| latent.baseline.as_ref());
         let stays = !self.stage.trains.contains_key(&Group::Baseline);
-        let windows = self.denoise.is_some() || self.elbo.is_some() || self.inverse.is_some() || self.value.is_some() || self.critic.is_some();
+        let windows =
+            self.denoise.is_some() || self.elbo.is_some() || self.inverse.is_some() || self.value.is_some() || self.critic.is_some();
         let Some(baseline) = baseline.filter(|_| stays && windows) else { return Ok(self) };
         let episodes = surprising(&self.task.split.episodes, baseline, &self.task.room)?;
         self.denoise.iter_mut().for_each(|loss| loss.look_at(&episodes));

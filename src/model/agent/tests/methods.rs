@@ -1,7 +1,7 @@
 //! Methods beside that of the paper's type (i): states alone with inverse dynamics, wishes, several rows at once, oracles.
 
 use super::*;
-use crate::model::method::{Diffused, Head, Inverse, LatentSource, Target, Told, TrueFuture};
+use crate::model::method::{AlphaBar, Diffused, Guide, Head, Inverse, LatentSource, Target, Told, TrueFuture};
 
 fn of_states(latents: bool, schedule: Schedule, network: Inverse) -> Agent {
     let backbone = if latents { unet() } else { Backbone::dit(16, 1, 2) };
@@ -94,6 +94,82 @@ fn policies_see_the_state_and_the_steps_before() {
     };
     assert_eq!(act(0.5, 0.6), act(0.5, 0.6));
     assert!(act(0.5, 0.6) != act(0.5, -0.6) && act(0.5, 0.6) != act(-0.5, 0.6));
+}
+
+fn of_critics(latents: bool, change: impl FnOnce(&mut ModelConfig)) -> Agent {
+    agent_with(latents, 1, Backbone::Mlp { width: 16, depth: 2, dropout: 0.1 }, |config| {
+        let plan = &mut config.method.plan;
+        (plan.diffused, plan.horizon, plan.level_max, plan.alpha) = (Diffused::Action, 1, 5, AlphaBar::VpLinear);
+        (plan.schedule, plan.target) = (Schedule::Uniform { steps: 5 }, Target::Eps);
+        config.method.guide = Some(Guide::Critic { width: 12 });
+        config.units.returns = Some(Affine { mean: vec![2.0], std: vec![3.0] });
+        (config.trained.sub_steps, config.trained.action_horizons) = (vec![1], vec![1]);
+        (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
+        change(config);
+    })
+}
+
+/// Critics choose the candidate whose first action is worth most to the lesser of them; they lead none, so that nobody can ask for that.
+#[test]
+fn critics_choose_among_actions() {
+    for latents in [true, false] {
+        let agent = of_critics(latents, |_| ());
+        let options = SamplerOptions { candidates: 16, temperature: 1.0, streaming: false, kappa: 0.0, action_horizon: 1, ..options() };
+        let state = vec![0.4, -0.3, 0.2];
+        let observation = Observation { state: state.clone(), ..Observation::default() };
+        let mut acts = [agent.begin(&agent.open(3, &options).unwrap(), &observation).unwrap()];
+        while !acts[0].is_done() {
+            agent.advance(&mut acts).unwrap();
+        }
+        let critic = agent.networks().critic.as_ref().unwrap();
+        let tensor = |values: &[f32]| candle_core::Tensor::from_slice(values, (1, 1, values.len()), &candle_core::Device::Cpu).unwrap();
+        let normal = tensor(&agent.config().units.normalizer.state.normalize(&state));
+        let worths: Vec<f32> = acts[0]
+            .candidates()
+            .iter()
+            .map(|window| {
+                let latent = latents.then(|| tensor(window.latents().mean_of_step(0)));
+                let both = critic.q(&normal, &tensor(window.action(0)), latent.as_ref()).unwrap();
+                both.map(|q| q.flatten_all().unwrap().to_vec1::<f32>().unwrap()[0]).into_iter().fold(f32::INFINITY, f32::min)
+            })
+            .collect();
+        let best = (0..16).max_by(|a, b| worths[*a].total_cmp(&worths[*b])).unwrap();
+        assert!(worths.iter().any(|worth| *worth < worths[best] - 1e-3), "{worths:?}");
+        let expected = acts[0].candidates()[best].action(0).to_vec();
+        let [act] = acts;
+        let (_, chunk) = agent.finish(act).unwrap();
+        assert_eq!(chunk.actions, [agent.config().units.normalizer.action.denormalize(&expected)]);
+        assert!((chunk.value.unwrap() - (2.0 + 3.0 * worths[best])).abs() < 1e-4);
+        assert_eq!((chunk.evaluations, chunk.passes), (16 * 5, 5));
+        let led = agent.open(1, &SamplerOptions { guidance_scale: 1.0, ..options });
+        assert!(matches!(led, Err(AgentError::InvalidOptions { field: "guidance_scale", .. })), "{led:?}");
+    }
+    let of_states = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, None, unet());
+    let mut method = of_states.method;
+    (method.plan.diffused, method.guide) = (Diffused::State, Some(Guide::Critic { width: 4 }));
+    method.head = Head::Inverse { network: Inverse::Mlp { width: 4 }, latent: false };
+    let refused = ModelConfig { method, units: Units { returns: Some(Affine::identity(1)), ..of_states.units }, ..of_states }.check();
+    assert_eq!(refused.unwrap_err().field, "method.guide");
+}
+
+/// Acts that choose, side by side with those that do not.
+#[test]
+fn a_batch_of_choosing_acts_is_its_rows() {
+    let agent = of_critics(true, |_| ());
+    let vary = |i: u64| SamplerOptions {
+        candidates: 1 + 5 * (i as usize % 3),
+        pick_temperature: if i % 2 == 0 { 0.0 } else { 0.7 },
+        eta: (i % 2) as f32,
+        temperature: 1.0,
+        streaming: false,
+        kappa: 0.0,
+        ..options()
+    };
+    let mut stream = Philox::new(4);
+    let observations: Vec<Observation> = (0..6).map(|_| observation(&mut stream)).collect();
+    let episodes: Vec<Episode> = (0..6).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
+    let [alone, together] = alone_and_together(&agent, &episodes, &observations);
+    assert_eq!(together, alone);
 }
 
 /// Rows of policies do not influence each other, whatever chunks they are asked for.
