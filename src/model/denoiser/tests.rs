@@ -154,8 +154,8 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     /// A row's bits are its own, whatever the batch, its place there, the processor's instructions, and how weights are held.
     #[test]
-    fn a_row_does_not_depend_on_its_batch(seeds in proptest::collection::vec(0_u64..1000, 1..40), unet: bool, half: bool) {
-        let denoiser = denoiser(backbones()[usize::from(!unet)].clone(), if half { Precision::Bf16 } else { Precision::F32 });
+    fn a_row_does_not_depend_on_its_batch(seeds in proptest::collection::vec(0_u64..1000, 1..40), which in 0_usize..5, half: bool) {
+        let denoiser = denoiser(backbones()[which].clone(), if half { Precision::Bf16 } else { Precision::F32 });
         let windows: Vec<Window> = seeds.into_iter().map(window).collect();
         let together = predict::<Buffer>(&denoiser, &windows);
         // Alone, and with every instruction set.
