@@ -158,7 +158,7 @@ fn a_batch_of_choosing_acts_is_its_rows() {
     let agent = of_critics(true, |_| ());
     let vary = |i: u64| SamplerOptions {
         candidates: 1 + 5 * (i as usize % 3),
-        pick_temperature: if i % 2 == 0 { 0.0 } else { 0.7 },
+        pick_temperature: if i.is_multiple_of(2) { 0.0 } else { 0.7 },
         eta: (i % 2) as f32,
         temperature: 1.0,
         streaming: false,
