@@ -6,10 +6,11 @@ use super::{
         Episode, Sides, Span,
         beside::Beside,
         hidden::Hide,
+        places::Places,
         returns::Returns,
         room::Room,
         surprises::surprising,
-        window::{Levels, Places, WindowShape, windows},
+        window::{Levels, WindowShape, windows},
     },
     *,
 };

@@ -27,7 +27,7 @@ from torch.nn import functional
 LEVEL_MAX = 40
 STATE, ACTION = 3, 2
 LOG_VAR = (-8.0, 2.0)
-SPREAD = {"log_var": 20.0, "prior.4": 6.0, "baseline.surprise": 8.0}
+SPREAD = {"log_var": 20.0, "prior.4": 6.0, "baseline.surprise": 8.0, "q1.4.weight": 12.0, "q2.4.weight": 12.0}
 
 Tensors = dict[str, Tensor]
 
@@ -313,6 +313,7 @@ class Critic(nn.Module):
         later = torch.where(given["ended"] > 0.5, self.END_WORTH, later)
         aim = given["gain"] + self.DISCOUNT * later
         u = torch.minimum(q1, q2).detach() - v
+        assert (u < 0).any() and (u > 0).any() and (q1 < q2).any() and (q1 > q2).any()
         of_v = (torch.where(u < 0, 1 - self.EXPECTILE, self.EXPECTILE) * u**2).mean()
         of_q = functional.mse_loss(q1, aim) + functional.mse_loss(q2, aim)
         return {"q1": q1, "q2": q2, "v": v, "loss": of_q + of_v, "loss_q": of_q, "loss_v": of_v}
@@ -598,9 +599,9 @@ def policy_cases() -> dict[str, tuple[nn.Module, Tensors]]:
             given |= {"x": torch.randn(batch, steps, ACTION), "observed": torch.randn(batch, 1, observed * (STATE + ACTION + 1))}
         return given
 
-    transitions = {name: torch.randn(9, 1, width) for name, width in (("state", STATE), ("action", ACTION), ("latents", 4))}
-    transitions |= {"next_state": torch.randn(9, 1, STATE), "next_latents": torch.randn(9, 1, 4), "gain": torch.randn(9, 1, 1)}
-    transitions |= {"ended": torch.randint(0, 2, (9, 1, 1)).double()}
+    transitions = {name: torch.randn(40, 1, width) for name, width in (("state", STATE), ("action", ACTION), ("latents", 4))}
+    transitions |= {"next_state": torch.randn(40, 1, STATE), "next_latents": torch.randn(40, 1, 4), "gain": torch.randn(40, 1, 1)}
+    transitions |= {"ended": torch.randint(0, 2, (40, 1, 1)).double()}
     return {
         "policy": (Policy(4, 2, (7, 3), (12, 3, 2, 2)), given(3, 7, 4, 3) | {"told": torch.randn(3, 1, 3)}),
         "policy_each": (Policy(0, 0, (5, 1), (10, 1, 0, 1)), given(2, 5, 0, 1)),
@@ -622,7 +623,7 @@ def run(network: nn.Module, given: Tensors) -> Tensors:
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             parameter += 0.1 * torch.randn_like(parameter)
-            # So that some log-variances and surprises reach their bounds, and others do not.
+            # So that some log-variances and surprises reach their bounds, and others do not; and either critic is the lesser now and then.
             parameter *= next((factor for part, factor in SPREAD.items() if part in name), 1.0)
             parameter.copy_(parameter.half())
     given = {name: value.half().double() for name, value in given.items()}

@@ -1,11 +1,14 @@
 //! Offline trajectories: read, checked, split by episodes, brought to the units of the networks.
 pub mod beside;
+pub mod blocks;
 pub mod hdf5;
 pub mod hidden;
+pub mod places;
 pub mod returns;
 pub mod room;
 pub mod rows;
 pub mod surprises;
+pub mod tokens;
 pub mod units;
 pub mod window;
 

@@ -5,7 +5,7 @@ use super::{
     Episode, Sides, Span,
     room::Room,
     rows::{FieldWriter, pieces, surprise_width},
-    window::TokenRows,
+    tokens::TokenRows,
 };
 use crate::{
     model::{

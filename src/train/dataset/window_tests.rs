@@ -5,8 +5,12 @@ use crate::{
     model::{
         config::ModelConfig,
         method::{Backbone, Schedule},
+        trajectory::Layout,
     },
-    train::dataset::{Sides, Span, Which},
+    train::dataset::{
+        Sides, Span, Which,
+        blocks::{BlockShape, blocks},
+    },
 };
 
 const LAYOUT: Layout = Layout { state_dim: 2, action_dim: 1 };
@@ -345,7 +349,7 @@ fn transitions_follow_one_another() {
         hide: Hide::NOTHING,
         beside: Beside::default(),
     };
-    let batch = transitions(&episodes, &transition_places(&episodes), &shape, &mut Philox::new(2)).unwrap();
+    let batch = transitions(&episodes, &Places::of_transitions(&episodes), &shape, &mut Philox::new(2)).unwrap();
     let [now, next] = [&batch.now, &batch.next].map(|windows| rows(&windows.window));
     let last = |windows: &WindowBatch| rows(&windows.history.state).into_iter().map(|row| row[2][0]).collect::<Vec<_>>();
     let (before_now, before_next) = (last(&batch.now), last(&batch.next));

@@ -17,7 +17,8 @@ use crate::train::{
     dataset::{
         HELD_OUT_SEED, Sides,
         hidden::Hide,
-        window::{Places, TransitionBatch, WindowShape, transition_places, transitions},
+        places::Places,
+        window::{TransitionBatch, WindowShape, transitions},
     },
     recipe::losses::{CriticConfig, Loss},
 };
@@ -51,7 +52,7 @@ impl<'a> CriticLoss<'a> {
             task,
             config,
             weight,
-            places: transition_places(&episodes.train),
+            places: Places::of_transitions(&episodes.train),
             shape,
             episodes,
             options: refine_options(task, false),
@@ -84,7 +85,7 @@ impl<'a> CriticLoss<'a> {
     pub fn held_out(&self, networks: &Networks) -> Result<f64> {
         let shape = WindowShape { batch: HELD_OUT_TRANSITIONS, hide: Hide::NOTHING, ..self.shape.clone() };
         let episodes = &self.episodes.held_out;
-        let batch = transitions(episodes, &transition_places(episodes), &shape, &mut Philox::new(HELD_OUT_SEED))?;
+        let batch = transitions(episodes, &Places::of_transitions(episodes), &shape, &mut Philox::new(HELD_OUT_SEED))?;
         let critic = networks.critic.as_ref().context(NO_CRITIC)?;
         Ok(f64::from(self.errors(networks, critic, &batch)?.loss.to_scalar::<f32>()?))
     }
@@ -149,12 +150,22 @@ mod tests {
     use crate::train::optimizer::{Adam, Ema};
     use candle_core::{Device, Tensor};
 
+    use super::Worth;
+
     const DISCOUNT: f64 = 0.8;
     const TAU: f64 = 0.75;
     const END: f64 = -0.5;
 
     fn column(values: &[f32], width: usize) -> Tensor {
         Tensor::from_slice(values, (values.len() / width, 1, width), &Device::Cpu).unwrap()
+    }
+
+    /// Units of 10 with mean 3 for rewards, of 4 with mean 2 for returns: half a reward's unit is 8, which for ever is 1.5 of a return's; nothing, after
+    /// an end, is half of one below the mean.
+    #[test]
+    fn rewards_are_worth_what_returns_are() {
+        let worth = Worth { reward: [3.0, 10.0], returns: [2.0, 4.0] };
+        assert_eq!([worth.of_reward(0.5), worth.of_raw(0.0)], [1.5, -0.5]);
     }
 
     /// A world of two states and two actions whose worths can be written down: in state 0 to stay pays .5 and to go pays nothing; in state 1 to

@@ -15,8 +15,9 @@ use crate::train::{
         HELD_OUT_SEED, Sides, Which,
         beside::Beside,
         hidden::Hide,
+        places::Places,
         returns::Returns,
-        window::{Levels, Places, WindowShape, windows},
+        window::{Levels, WindowShape, windows},
     },
     recipe::{
         losses::{Loss, TrainingLevels},

@@ -11,7 +11,8 @@ use crate::train::{
     Task,
     dataset::{
         Episode, HELD_OUT_SEED, Sides,
-        window::{BlockShape, Places, blocks},
+        blocks::{BlockShape, blocks},
+        places::Places,
     },
     learner::Scalars,
     recipe::losses::{ElboConfig, Loss},

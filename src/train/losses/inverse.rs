@@ -23,7 +23,8 @@ use crate::train::{
     dataset::{
         HELD_OUT_SEED, Sides,
         hidden::Hide,
-        window::{Places, WindowShape, windows},
+        places::Places,
+        window::{WindowShape, windows},
     },
     recipe::losses::Loss,
 };
