@@ -105,8 +105,9 @@ def _summary(card: dict[str, Any], path: Path) -> str:
 
     returns, lengths = card["returns"], card["lengths"]
     error = "" if returns["standard_error"] is None else f" +- {returns['standard_error']:.2f}"
+    length = f"{lengths['min']} to {lengths['max']}" if lengths["min"] < lengths["max"] else str(lengths["max"])
     lines = [
-        f"{path}: {card['episodes']} episodes of {lengths['min']} to {lengths['max']} steps, {card['steps']} steps; "
+        f"{path}: {card['episodes']} episodes of {length} steps, {card['steps']} steps; "
         f"return {returns['mean']:.2f}{error}, median {returns['median']:.2f}",
         *(f"{word}: {_parts(card[word])}" for word in ("observations", "actions", "context") if word in card),
         *(f"note: {note}" for note in card["notes"]),

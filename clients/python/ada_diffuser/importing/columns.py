@@ -181,6 +181,8 @@ def _described(dtype: np.dtype) -> str:
     match dtype.kind:
         case "i" | "u":
             return "whole numbers"
+        case "f":
+            return "floats"
         case "b":
             return "flags"
         case "c":

@@ -108,10 +108,9 @@ class D4rlSource:
         here, following = self._arrays.get("observations"), self._arrays.get(_NEXT)
         if here is None or following is None or here.shape != following.shape or here.ndim > 2 or here.dtype.kind != "f":
             return
-        if len(here) != self.steps:
-            return
-        led_to = following[rows.start : rows.stop].reshape(len(rows), -1)
-        came = here[rows.start + 1 : rows.stop + 1].reshape(-1, led_to.shape[1])
+        later = range(rows.start + 1, min(rows.stop + 1, self.steps))
+        led_to = Column(_NEXT, following, rows, self.steps).read().reshape(len(rows), -1)
+        came = Column("observations", here, later, self.steps).read().reshape(len(later), -1)
         ends = (self._terminals | self._timeouts)[rows.start : rows.stop][: len(came)]
         same = np.isclose(led_to[: len(came)], came, rtol=_NEAR, atol=_NEAR).all(axis=1)
         self._jumps.extend((rows.start + np.flatnonzero(~same & ~ends)).tolist())

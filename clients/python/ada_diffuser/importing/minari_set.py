@@ -58,7 +58,7 @@ class MinariSource:
         told = {key: _info(name, key, array, steps) for key, array in leaves(episode.infos or {}, "infos")}
         actions = dict(leaves(episode.actions, "actions"))
         if list(actions) != ["actions"]:
-            raise InvalidData(f"{name}/actions", f"has the parts {', '.join(actions)}: actions are one vector here")
+            raise InvalidData(f"{name}/actions", f"has the parts {', '.join(map(_short, actions))}: actions are one vector here")
         terminals, timeouts = (flags(column(key, getattr(episode, key))) for key in ("terminations", "truncations"))
         terminals, timeouts = self._ends.of(terminals, timeouts)
         return Block(
@@ -87,8 +87,8 @@ def _info(name: str, key: str, array: np.ndarray, steps: int) -> Column:
 
 
 def _short(key: str) -> str:
-    """Parts of a dict go by their own names; a vector goes by `observations`."""
-    return key.removeprefix("observations/")
+    """Parts of a dict go by their own names; a vector goes by `observations`, or `actions`."""
+    return key.removeprefix("observations/").removeprefix("actions/")
 
 
 def _next(episodes: Iterator[Any], index: int) -> Any:

@@ -65,9 +65,8 @@ def opened(request: Request) -> Iterator[Source]:
         return
     if kind not in _FILES:
         raise ValueError(f"format {kind!r} is none of d4rl, minari, robomimic")
-    path = _file(request.source)
-    with h5py.File(path, "r") as file:
-        yield _FILES[kind](path, file, request)
+    with _file(request.source) as file:
+        yield _FILES[kind](Path(request.source), file, request)
 
 
 def recognised(source: str) -> str:
@@ -79,7 +78,7 @@ def recognised(source: str) -> str:
         raise InvalidData("", f"{source} is a folder without data/metadata.json, so no Minari data set; other formats are single files")
     if not path.exists() and _MINARI_ID.fullmatch(source):
         return "minari"
-    with h5py.File(_file(source), "r") as file:
+    with _file(source) as file:
         roots = list(file)
         data = list(file["data"]) if isinstance(file.get("data"), h5py.Group) else []
     if "observations" in roots or "actions" in roots:
@@ -97,12 +96,15 @@ def recognised(source: str) -> str:
     )
 
 
-def _file(source: str) -> Path:
+def _file(source: str) -> h5py.File:
     path = Path(source)
     if not path.exists():
         raise InvalidData("", f"{source} is not there, and no id of a Minari data set, as D4RL/pointmaze/umaze-v2")
     if path.is_dir():
         raise InvalidData("", f"{source} is a folder, and one HDF5 file is expected")
     if not h5py.is_hdf5(path):
-        raise InvalidData("", f"{source} is no HDF5 file, or only a part of one")
-    return path
+        raise InvalidData("", f"{source} is no HDF5 file")
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise InvalidData("", f"{source} cannot be opened, or is only a part of a file: {error}") from None
