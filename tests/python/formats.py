@@ -39,7 +39,7 @@ def d4rl_columns() -> Arrays:
 def write_d4rl(path: Path, columns: Arrays) -> Path:
     with h5py.File(path, "w") as file:
         for name, values in columns.items():
-            file.create_dataset(name, data=values, compression="gzip")
+            file.create_dataset(name, data=values, compression="gzip" if np.ndim(values) else None)
         file["metadata/algorithm"] = np.bytes_("SAC")
         file["metadata/iteration"] = 100
         file["metadata/policy/fc0/weight"] = np.zeros((256, 3), np.float32)

@@ -271,8 +271,11 @@ def test_a_raw_file_has_its_states_and_libero_its_flags_for_rewards() -> None:
     assert "rewards are zeros: --reward zero" in card()["notes"]
 
 
-def test_what_readme_shows_is_what_works(capsys: pytest.CaptureFixture[str]) -> None:
-    """Every line of clients/python/README.md under "Data of others", on files of those names."""
+@pytest.mark.parametrize(
+    ("document", "title", "count"), [("clients/python/README.md", "Data of others", 5), ("docs/data.md", "From other layouts", 2)]
+)
+def test_what_the_documents_show_is_what_works(document: str, title: str, count: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every line of the first block under the title, on files of those names."""
     columns = d4rl_columns()
     for name in ("halfcheetah_medium-v2.hdf5", "maze2d-umaze-sparse-v1.hdf5"):
         write_d4rl(Path(name), columns)
@@ -281,9 +284,9 @@ def test_what_readme_shows_is_what_works(capsys: pytest.CaptureFixture[str]) -> 
     with h5py.File(write_robomimic(Path("low_dim_v141.hdf5")), "a") as file:
         for demo in file["data"].values():
             demo["obs/robot0_eef_quat"] = demo["obs/object"][()]
-    section = (ROOT / "clients/python/README.md").read_text(encoding="utf-8").split("\n### Data of others\n")[1]
+    section = (ROOT / document).read_text(encoding="utf-8").split(f"# {title}\n")[1]
     lines = section.split("```sh\n")[1].split("```")[0].replace("\\\n", " ").splitlines()
-    assert len(lines) == 5
+    assert len(lines) == count
     for line in lines:
         program, *words = shlex.split(line, comments=True)
         assert program == "ada-import" and main([*words, "--quiet"]) == 0, (line, capsys.readouterr().err)

@@ -234,7 +234,7 @@ ROBOMIMIC: dict[str, tuple[Callable[[h5py.File], Any], list[str], list[str]]] = 
     "other actions": (
         demo_of(replaced("actions", lambda values: values[:, :1])),
         PICK,
-        ["`data/demo_3/actions`: has 1 columns, but `actions`"],
+        ["`data/demo_3/actions`: has 1 columns, but `data/demo_0/actions` has 2"],
     ),
     "no rewards": (demo_of(lambda demo: demo.pop("rewards")), PICK, ["`data/demo_3/rewards`: is missing", "--reward zero"]),
     "other count": (

@@ -110,7 +110,7 @@ class D4rlSource:
             return
         later = range(rows.start + 1, min(rows.stop + 1, self.steps))
         led_to = Column(_NEXT, following, rows, self.steps).read().reshape(len(rows), -1)
-        came = Column("observations", here, later, self.steps).read().reshape(len(later), -1)
+        came = Column("observations", here, later, self.steps).read().reshape(len(later), led_to.shape[1])
         ends = (self._terminals | self._timeouts)[rows.start : rows.stop][: len(came)]
         same = np.isclose(led_to[: len(came)], came, rtol=_NEAR, atol=_NEAR).all(axis=1)
         self._jumps.extend((rows.start + np.flatnonzero(~same & ~ends)).tolist())
