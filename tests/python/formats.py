@@ -41,7 +41,7 @@ def write_d4rl(path: Path, columns: Arrays) -> Path:
         for name, values in columns.items():
             file.create_dataset(name, data=values, compression="gzip" if np.ndim(values) else None)
         file["metadata/algorithm"] = np.bytes_("SAC")
-        file["metadata/iteration"] = 100
+        file["metadata/iteration"], file["infos/nothing"] = 100, h5py.Empty("f4")
         file["metadata/policy/fc0/weight"] = np.zeros((256, 3), np.float32)
     return path
 

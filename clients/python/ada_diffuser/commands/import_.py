@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--context", metavar="KEY,..", help="the hidden truth, joined in this order (default: infos/context)")
     parser.add_argument("--filter", metavar="KEY", help="the demonstrations of this mask of a robomimic file (default: all)")
     parser.add_argument("--episode-steps", type=int, metavar="N", help="where the clock ended episodes, for a D4RL file without timeouts")
-    parser.add_argument("--reward", choices=("zero",), help="write zeros, for a source without rewards")
+    parser.add_argument("--reward", choices=("zero",), help="write zeros for rewards, as for a source that has none")
     parser.add_argument("--json", action="store_true", help="print the data card instead of a summary")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser

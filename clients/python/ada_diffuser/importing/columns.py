@@ -131,7 +131,9 @@ def leaves(group: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     if isinstance(group, tuple):
         group = {str(index): value for index, value in enumerate(group)}
     if not isinstance(group, Mapping):
-        yield name, group if isinstance(group, h5py.Dataset) else np.asarray(group)
+        array = group if isinstance(group, h5py.Dataset) else np.asarray(group)
+        if array.shape is not None:  # HDF5 knows arrays without even a shape
+            yield name, array
         return
     for key in group:
         path = f"{name}/{key}" if name else str(key)

@@ -122,7 +122,7 @@ class D4rlSource:
         if len(self._jumps) > inner / 2:
             why = (
                 f"is not the row after its own at {len(self._jumps)} of the {inner} rows that end no episode: these are single steps in no "
-                "order, and whole episodes are needed"
+                f"order, and whole episodes are needed (where they are whole all the same, import a copy without `{_NEXT}`)"
             )
             raise InvalidData(_NEXT, why, self._jumps[0])
         self.notes.append(
