@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from ada_diffuser import environments
-from ada_diffuser.collect import returns_summary
+from ada_diffuser.dataset import returns_summary
 from ada_diffuser.experts import Expert, formula_of, kept_expert, load_expert, recipe_for
 
 ROOT = Path(__file__).resolve().parent.parent

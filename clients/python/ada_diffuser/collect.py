@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from . import environments
-from .dataset import Episodes
+from .dataset import Episodes, returns_summary
 from .experts import Expert
 
 
@@ -207,15 +207,3 @@ def data_card(job: Job, expert: Expert, episodes: Episodes, failed: np.ndarray, 
     if job.play:
         card["play"] = {"share": job.play, "played": summary(played), "demonstrated": summary(~played)}
     return card | {"versions": {name: version(name) for name in ("ada-diffuser", "gymnasium", "h5py", "mujoco", "numpy")}}
-
-
-def returns_summary(returns: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
-    """What a card says of the returns (episodes,) of at least one episode, and of which failed."""
-    return {
-        "mean": round(float(returns.mean()), 3),
-        "standard_error": round(float(returns.std(ddof=1) / np.sqrt(len(returns))), 3) if len(returns) > 1 else None,
-        "median": round(float(np.median(returns)), 3),
-        "min": round(float(returns.min()), 3),
-        "max": round(float(returns.max()), 3),
-        "failures": int(failed.sum()),
-    }
