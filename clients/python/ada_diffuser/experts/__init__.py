@@ -11,14 +11,18 @@ from .policy import (
     random_expert,
     save_expert,
 )
+from .snapshots import QUALITIES, Flight, flights
 from .training import ExpertRecipe, formula_of, make_expert, recipe_for
 
 __all__ = [
+    "QUALITIES",
     "CalledExpert",
     "Expert",
     "ExpertRecipe",
+    "Flight",
     "LinearPolicy",
     "PolicyBank",
+    "flights",
     "formula_of",
     "import_expert",
     "kept_expert",

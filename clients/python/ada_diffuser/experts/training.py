@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import multiprocessing
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -54,6 +54,12 @@ class ExpertRecipe:
     def iterations(self) -> int:
         """Of all searches together."""
         return max(1, len(self.targets)) * self.seeds * self.ars.iterations
+
+    @classmethod
+    def from_json(cls, plain: Mapping[str, Any]) -> ExpertRecipe:
+        """From what `to_json` made."""
+        tuples = {name: tuple(plain[name]) for name in ("targets", "judge_noise")}
+        return cls(**{**plain, **tuples, "ars": ArsSettings(**plain["ars"])})
 
     def to_json(self) -> dict[str, Any]:
         """The recipe as plain JSON values."""
@@ -118,13 +124,17 @@ def make_expert(recipe: ExpertRecipe, progress: Callable[[int], object] = lambda
     card = {
         "kind": "ars",
         "recipe": recipe.to_json(),
-        "policies": [record for _, record in best],
-        "searches": [record for slot in slots for _, record in slot],
+        "policies": [record for _, record, _ in best],
+        "searches": [record for slot in slots for _, record, _ in slot],
     }
-    return PolicyBank([policy for policy, _ in best], targets, card)
+    return PolicyBank([policy for policy, *_ in best], targets, card, best[0][2])
 
 
-def _run_searches(recipe: ExpertRecipe, progress: Callable[[int], object]) -> list[tuple[LinearPolicy, dict[str, Any]]]:
+Found = tuple[LinearPolicy, dict[str, Any], list[LinearPolicy] | None]
+"""What a search brings: its best policy, what the card says of it, and the policy after each iteration where that is kept."""
+
+
+def _run_searches(recipe: ExpertRecipe, progress: Callable[[int], object]) -> list[Found]:
     """All searches in order: those of the first policy, then those of the next."""
     jobs = [(recipe, slot, number) for slot in range(max(1, len(recipe.targets))) for number in range(recipe.seeds)]
     # Spawned, not forked: a fork would copy whatever threads the caller's libraries run.
@@ -168,9 +178,10 @@ class _Course:
         self.env, self.steps = env.unwrapped, environments.steps_max(env)
         self.varied = {name: (getattr(self.env, name), share) for name, share in how.varies.items()}
         self.practice = {name: (getattr(self.env, name), value) for name, value in how.practice.items()}
-        self.sees_context = not (recipe.targets or recipe.blind)
         self.env.reset(seed=0)  # what a class draws there need not be there earlier
-        context_size = len(self.env.context) if self.sees_context else 0
+        context = getattr(self.env, "context", None)
+        self.sees_context = context is not None and not (recipe.targets or recipe.blind)
+        context_size = len(context) if self.sees_context else 0
         self.shape = (self.env.action_space.shape[0], self.env.observation_space.shape[0] + context_size)
 
     def practise(self, policy: LinearPolicy, seed: int) -> tuple[float, np.ndarray]:
@@ -220,18 +231,27 @@ class _Course:
         return total, np.array(visited, np.float64)
 
 
-def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> tuple[LinearPolicy, dict[str, Any]]:
+def search_rngs(seed: int, slot: int, number: int) -> list[np.random.Generator]:
+    """Of one search: what draws its perturbations, the episodes that its iterates are judged by, and the fresh ones."""
+    return [np.random.default_rng([seed, slot, number, part]) for part in range(3)]
+
+
+def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> Found:
     """One search: the best iterate on evaluation episodes, and what it reaches on fresh ones."""
     course = _Course(recipe, slot)
-    search_rng, judge_rng, fresh_rng = (np.random.default_rng([recipe.seed, slot, number, part]) for part in range(3))
+    search_rng, judge_rng, fresh_rng = search_rngs(recipe.seed, slot, number)
     judge_seeds = judge_rng.integers(2**31, size=JUDGE_EPISODES)
     best, best_score, best_iteration = None, -np.inf, 0
+    run: list[LinearPolicy] = []
+    judged: list[tuple[int, float]] = []
     for iteration, policy in enumerate(search(course.practise, course.shape, recipe.ars, search_rng), start=1):
         with _iterations_done.get_lock():
             _iterations_done.value += 1
+        run.append(policy)
         if iteration % JUDGE_EVERY and iteration != recipe.ars.iterations:
             continue
         score = float(course.judge(policy, judge_seeds, recipe.judge_noise)[0].mean())
+        judged.append((iteration, round(score, 3)))
         if score > best_score:
             best, best_score, best_iteration = policy, score, iteration
     if best is None:
@@ -245,4 +265,6 @@ def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> tuple[LinearPol
         "fresh": course.summary(best, fresh_seeds, recipe.judge_noise),
         "fresh_without_noise": course.summary(best, fresh_seeds, (0.0,)),
     }
-    return best, record
+    if not course.env.search.keeps_run or recipe.targets:
+        return best, record, None
+    return best, record | {"run": judged}, run
