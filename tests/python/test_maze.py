@@ -105,7 +105,7 @@ def test_without_the_extra_the_package_works_and_the_maze_says_what_to_install(t
         "environments.make('point-wind-s').reset(seed=0)\n"
         "environments.make(sys.argv[1])\n"
     )
-    for name in ("maze2d-umaze",):
+    for name in ("maze2d-umaze", "kitchen-mixed"):
         done = subprocess.run([sys.executable, "-c", code, name], capture_output=True, text=True, cwd=tmp_path, check=False)
         assert "pip install 'ada-diffuser[robotics]'" in done.stderr.splitlines()[-1], done.stderr
 

@@ -27,6 +27,8 @@ D4RL = {
     "maze2d-umaze": (23.85, 161.86),
     "maze2d-medium": (13.13, 277.39),
     "maze2d-large": (6.7, 273.99),
+    "kitchen-mixed": (0.0, 4.0),
+    "kitchen-partial": (0.0, 4.0),
 }
 """Reference returns: random, expert (`d4rl/infos.py`)."""
 

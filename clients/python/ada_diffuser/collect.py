@@ -170,6 +170,7 @@ def _fly(
         if other.context is None:
             raise ValueError(f"--play: {env.spec.id} has no hidden context that an expert could be told falsely")
     _check_fit(env, expert)  # not before: what a class draws in `reset` need not be there earlier
+    expert.begin(rng)
     low, high = env.action_space.low, env.action_space.high
     steps: list[tuple[Any, ...]] = []
     ended = False

@@ -20,6 +20,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
 from .cheetah_switching import CheetahCumulativeS, CheetahDelayedS, CheetahGaleS
+from .kitchen import KitchenMixed, KitchenPartial
 from .legged import HopperGravityE, WalkerMassE
 from .maze import Maze2dLarge, Maze2dMedium, Maze2dUmaze
 from .pendulum import PendulumGravityE
@@ -43,6 +44,8 @@ __all__ = [
     "CheetahWindS",
     "HiddenTask",
     "HopperGravityE",
+    "KitchenMixed",
+    "KitchenPartial",
     "Maze2dLarge",
     "Maze2dMedium",
     "Maze2dUmaze",

@@ -54,6 +54,10 @@ class Task(gym.Env[np.ndarray, np.ndarray]):
     not; where nothing is hidden and there is a `goal` it is told that in the place of the context, and None where there is neither. It
     may use the environment's options, but nothing of the running episode. Its docstring's first line is the law on the data card."""
 
+    expert_plan: ClassVar[Callable[..., Any] | None] = None
+    """The expert, where it remembers what it did: a method `expert_plan(self, rng)` that answers, for one episode, a function of
+    observation and context as `expert_action` is one. All that it draws it draws from `rng`. Its docstring's first line is on the card."""
+
     search: ClassVar[Search | None] = Search()
     """How the expert is searched for, where there is no formula."""
 

@@ -23,8 +23,14 @@ class Expert(Protocol):
         """(observation size, action size) it is made for, in an environment with that context size (0: it tells none); None: any."""
         ...
 
+    def begin(self, rng: np.random.Generator) -> None:
+        """An episode begins. What an expert draws it draws from `rng`; one without a memory draws nothing."""
+        ...
+
     def act(self, observation: np.ndarray, context: np.ndarray | None) -> np.ndarray:
-        """Action for an observation and the context of the coming step, None where the environment tells none; not clipped."""
+        """Action for an observation and the context of the coming step, not clipped. Where the environment tells no context it is the goal,
+        and None where there is none either.
+        """
         ...
 
 
@@ -44,9 +50,37 @@ class CalledExpert:
         """See `Expert.sizes`."""
         return None
 
+    def begin(self, rng: np.random.Generator) -> None:
+        """See `Expert.begin`."""
+
     def act(self, observation: np.ndarray, context: np.ndarray | None) -> np.ndarray:
         """See `Expert.act`."""
         return np.asarray(self.function(observation, context), np.float64)
+
+
+@dataclass
+class PlannedExpert:
+    """An expert that remembers where it stands in an episode.
+
+    Attributes:
+        plan: makes, from a generator, the function of observation and context that flies one episode, called once a step.
+        card: where it comes from.
+    """
+
+    plan: Callable[[np.random.Generator], Callable[[np.ndarray, np.ndarray | None], Any]]
+    card: dict[str, Any]
+
+    def sizes(self, context_size: int) -> None:
+        """See `Expert.sizes`."""
+        return None
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """See `Expert.begin`."""
+        self._function = self.plan(rng)
+
+    def act(self, observation: np.ndarray, context: np.ndarray | None) -> np.ndarray:
+        """See `Expert.act`."""
+        return np.asarray(self._function(observation, context), np.float64)
 
 
 def import_expert(name: str) -> CalledExpert:
@@ -108,6 +142,9 @@ class PolicyBank:
         """See `Expert.sizes`."""
         actions, features = self.policies[0].weights.shape
         return features - (context_size if self.targets is None else 0), actions
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """See `Expert.begin`."""
 
     def act(self, observation: np.ndarray, context: np.ndarray | None) -> np.ndarray:
         """See `Expert.act`."""

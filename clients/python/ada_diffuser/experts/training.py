@@ -17,7 +17,7 @@ from .. import environments
 from ..environments import ArsSettings, Search
 from ..leash import end_with
 from .ars import search
-from .policy import CalledExpert, LinearPolicy, PolicyBank
+from .policy import CalledExpert, LinearPolicy, PlannedExpert, PolicyBank
 
 PROCESSES_MAX = 2
 POLL_S = 0.5
@@ -69,21 +69,31 @@ class ExpertRecipe:
         return plain
 
 
-def formula_of(env: gym.Env, *, blind: bool = False) -> CalledExpert | None:
+def formula_of(env: gym.Env, *, blind: bool = False) -> CalledExpert | PlannedExpert | None:
     """The expert that the environment's class has as a method, with the options of `env`; None where there is none.
 
-    A blind one is told the environment's `mean_context`, whatever the context is. Raises `ValueError` where it has none.
+    It is the formula `expert_action`, or the plan `expert_plan`, which is made anew for each episode. A blind one is told the environment's
+    `mean_context`, whatever the context is. Raises `ValueError` where it has none.
     """
-    act = getattr(env.unwrapped, "expert_action", None)
+    act, plan = (getattr(env.unwrapped, name, None) for name in ("expert_action", "expert_plan"))
+    if callable(plan):
+        if blind:
+            raise ValueError(f"{env.spec.id} has an expert that plans, and none that is blind")
+        return PlannedExpert(plan, {"kind": "planned", "law": _first_line(plan)})
     if not callable(act):
         return None
-    card = {"kind": "analytic", "law": inspect.cleandoc(act.__doc__ or "").partition("\n")[0]}
+    card = {"kind": "analytic", "law": _first_line(act)}
     if not blind:
         return CalledExpert(act, card)
     mean = getattr(env.unwrapped, "mean_context", None)
     if mean is None:
         raise ValueError(f"{env.spec.id} has no mean_context, which its formula could take for the one that a blind expert does not see")
     return CalledExpert(lambda observation, context: act(observation, mean), {**card, "told": mean.tolist()})
+
+
+def _first_line(method: Callable[..., Any]) -> str:
+    """Of its docstring."""
+    return inspect.cleandoc(method.__doc__ or "").partition("\n")[0]
 
 
 def recipe_for(
