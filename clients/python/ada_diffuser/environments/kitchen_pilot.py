@@ -26,6 +26,8 @@ MIDDLE = np.array([0.0, 0.0, 0.8, -1.75, 0.0, 1.2, 0.8])
 MARGIN = 0.05
 """From the end of a joint, where it is not driven any further, rad."""
 LOW, HIGH = JOINTS_LOW[:ARM] + MARGIN, np.minimum(JOINTS_HIGH[:ARM], [2.9, 1.76, 2.9, -0.4, 2.9, 2.11, 2.9]) - MARGIN
+STEERING = 0.2
+"""To the side, m, for each radian that a thing has turned."""
 LATCHED, MISSED = 0.28, 0.3
 """Distances of a subtask from its goal: within the first the pilot leaves it, from the second on, where nothing counts, it tries again."""
 
@@ -41,6 +43,7 @@ class Pose:
         steps: after which the pilot goes on in any case.
         turn: of the hand: how far it points down, to the left, and is rolled about where it points, rad.
         works: whether it ends as soon as the subtask is done.
+        steers: whether the hand stays behind the middle of the thing, wherever that goes, and to the side that turns it back.
     """
 
     offset: tuple[float, float, float]
@@ -49,6 +52,7 @@ class Pose:
     steps: int = 25
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     works: bool = False
+    steers: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ SCRIPTS = {
             Pose((0.0, -0.25, 0.08), OPEN, 0.06, turn=DOWN),
             Pose((0.0, -0.20, -0.16), OPEN, 0.03, turn=DOWN),
             Pose((0.0, -0.02, -0.17), OPEN, 0.03, 20, DOWN),
-            Pose((0.0, 0.22, -0.18), OPEN, 0.03, 40, DOWN, works=True),
+            Pose((0.0, 0.22, -0.18), OPEN, 0.03, 40, DOWN, works=True, steers=True),
         ),
     ),
     "bottom burner": Script(
@@ -115,8 +119,8 @@ TRIES = 2
 BACK_Y, BACK_STEPS = 0.36, 8
 """How far the hand goes back after each try, and for how long at most."""
 HOME, HOME_GAIN, HOME_NEAR, HOME_STEPS = START[:ARM], 5.0, 0.25, 20
-"""Then the joints go to where an episode begins, at so many 1/s, to so many rad, for so many steps at most: from elsewhere the arm would come
-to a thing bent in another way, and find its joints at their ends."""
+"""Then the joints go to where an episode begins, at so many 1/s, to so many rad, for so many steps at most: from elsewhere the arm would
+come to a thing bent in another way, and find its joints at their ends."""
 
 
 class Pilot:
@@ -171,7 +175,11 @@ class Pilot:
 
     def _go(self, origin: np.ndarray, pose: Pose, subtask: str) -> Iterator[np.ndarray]:
         place, turn = origin + pose.offset, _turned(*pose.turn)
+        thing = self._model.site(SCRIPTS[subtask].site).id
         for _ in range(pose.steps):
+            if pose.steers:
+                frame = self._kinematics.site_xmat[thing]
+                place[0] = self._kinematics.site_xpos[thing][0] - STEERING * np.arctan2(frame[3], frame[0])
             if pose.works and self._distance(subtask, self._seen) < LATCHED:
                 return
             if np.linalg.norm(place - self._kinematics.site_xpos[self._hand]) < pose.near:

@@ -47,7 +47,3 @@ class Walker2d(Task, Walker2dEnv, name="walker2d", id="ada/Walker2d-v0"):
         clipped = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
         observation, reward, terminated, truncated, info = super().step(clipped)
         return observation.astype(np.float32), float(reward), bool(terminated), truncated, info
-
-    def failed(self, episode_return: float) -> bool:
-        """Whether a finished episode earned less than standing through it would."""
-        return episode_return < self.episode_steps
