@@ -26,12 +26,12 @@ observations, actions (as executed), rewards, terminals, timeouts, infos/context
 Beside it goes X.card.json: environment, options, seed, returns, expert, SHA-256, the command. infos/context is written where
 `info["context"]` tells it.
 
-An environment's class says what its expert is. A formula (its method `expert_action`) flies at once. Where there is none, policies
-are searched for here (Augmented Random Search, linear policies; for the cheetah one to two minutes for each search, two at a
-time) and kept beside the data as X.expert.npz; a later call with the same environment, options, and expert settings uses that
-file again. An environment that says nothing of it needs --expert: a function of yours that takes the observation and the
-context, which is None unless the environment has an attribute `context`, or random actions. The same arguments give the same
-bytes.
+An environment's class says what its expert is. A formula (its method `expert_action`) or a plan (`expert_plan`) flies at once. Where
+there is none, policies are searched for here (Augmented Random Search, linear policies; for the cheetah one to two minutes for each
+search, two at a time) and kept beside the data as X.expert.npz; a later call with the same environment, options, and expert settings
+uses that file again. An environment that says nothing of it needs --expert: a function of yours that takes the observation and the
+context (the attribute `context` of the environment; else its `goal`, which goes to infos/goal; else None), or random actions. The
+same arguments give the same bytes.
 
 --blind S has a share S of the episodes, drawn by the seed, flown by an expert that does not see the context: policies searched
 for without it and kept as X.blind.npz, or the formula with the context's mean, where the class says what that is (`mean_context`).
