@@ -81,9 +81,9 @@ SCRIPTS = {
         "kettle_site",
         (
             Pose((0.0, -0.25, 0.08), OPEN, 0.06, turn=DOWN),
-            Pose((0.0, -0.20, -0.16), OPEN, 0.03, turn=DOWN),
-            Pose((0.0, -0.02, -0.17), OPEN, 0.03, 20, DOWN),
-            Pose((0.0, 0.22, -0.18), OPEN, 0.03, 40, DOWN, works=True, steers=True),
+            Pose((0.0, -0.20, -0.15), OPEN, 0.03, turn=DOWN),
+            Pose((0.0, -0.02, -0.15), OPEN, 0.03, 20, DOWN),
+            Pose((0.0, 0.22, -0.15), OPEN, 0.03, 40, DOWN, works=True, steers=True),
         ),
     ),
     "bottom burner": Script(
