@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from fake_server import Core, serving
 from PIL import Image
+from server import ROOT, running
 
 from ada_diffuser import Client, SamplerOptions, environments
 from ada_diffuser.collect import Job, collect
@@ -23,6 +25,7 @@ from ada_diffuser.experts import formula_of
 from ada_diffuser.rollout import Episode, Trial, evaluate
 from ada_diffuser.rollout.film import Panel, save_film
 
+TRAINER = Path(os.environ.get("ADA_TRAINER", ROOT / "target/release/ada-trainer"))
 MAZES = {"maze2d-umaze": (300, (5, 5), 7), "maze2d-medium": (600, (8, 8), 26), "maze2d-large": (800, (9, 12), 46)}
 """Steps of an episode, rows and columns, and cells that are free."""
 
@@ -221,3 +224,36 @@ def test_what_the_maze_says_stands_beside_the_return(core: Core, url: str, tmp_p
     finally:
         plot._draw_ways = original
     assert plain.read_bytes() != (tmp_path / "a.png").read_bytes(), "ways in the place of a context"
+
+
+TINY = [
+    "model.plan.horizon=16",
+    "losses.elbo.batch=4",
+    "losses.denoise.batch=4",
+    "stages.identify.steps=2",
+    "stages.identify.learning_rate.warm_up=1",
+    "stages.denoise.steps=2",
+    "stages.denoise.learning_rate.warm_up=1",
+]
+
+
+def test_the_planner_with_a_goal_is_trained_on_the_mazes_data_and_told_by_the_command(tmp_path: Path, capsys) -> None:
+    """Of the recipe and methods that ship; the guidance beyond what is told is refused wherever nothing is."""
+    data = tmp_path / "maze.h5"
+    assert collect_command(["--env", "maze2d-umaze", "--episodes", "4", "--quiet", "--out", str(data)]) == 0
+    recipe = [str(ROOT / "models/maze2d-umaze/recipe.toml"), "--data", str(data), "--out", str(tmp_path / "models/maze")]
+    methods = [word for name in ("planner-ii", "told-goal") for word in ("--with", str(ROOT / f"models/methods/{name}.toml"))]
+    words = [word for key in TINY for word in ("--set", key)]
+    subprocess.run([str(TRAINER), "run", *recipe, *methods, *words], check=True, capture_output=True, cwd=tmp_path, timeout=120)
+    with running(tmp_path / "log", "--models", str(tmp_path / "models"), "--default-model", "maze") as address:
+        for options in (["free_guidance_scale=1.2"], ["free_guidance_scale=1.2", "told_goal=[1,-1]"]):
+            flags = [word for option in ["streaming=false", *options] for word in ("--option", option)]
+            where = ["--env", "maze2d-umaze", "--url", address, "--episodes", "2", "--vector", "2", "--episode-steps", "6", "--seed", "5"]
+            assert rollout_command.main([*where, *flags, "--no-table", "--json", str(tmp_path / "a.json")]) == 0
+            numbers = json.loads((tmp_path / "a.json").read_text())
+            assert numbers["options"].get("told_goal") == ([1.0, -1.0] if len(options) > 1 else None)
+        with Client(f"grpc://{address}") as client:
+            own = evaluate(client, Trial("maze2d-umaze", "maze", 2, 5, options=SamplerOptions(streaming=False), episode_steps=6))
+            same = evaluate(client, replace(own.trial, options=SamplerOptions(streaming=False, told_goal=(1.0, -1.0))))
+    assert not np.array_equal(own.episodes[0].actions, same.episodes[0].actions), "another goal, another way"
+    capsys.readouterr()
