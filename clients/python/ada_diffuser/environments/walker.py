@@ -17,6 +17,9 @@ class Walker2d(Task, Walker2dEnv, name="walker2d", id="ada/Walker2d-v0"):
 
         r = v + 1 (unless it has fallen) - .001 a.a, v in m/s                   1000 steps of .008 s, fewer where it falls
 
+    Its expert is the best of one search of 150 iterations, 4800 episodes: a linear policy, which is why it stays far below D4RL's 4592. On 48
+    fresh episodes it earns 2919 ± 38 without noise, 2294 ± 113 with that of the data; the policy half way to it (iteration 120) earns a third.
+
     Args:
         render_mode: `rgb_array` or None.
     """
@@ -24,7 +27,7 @@ class Walker2d(Task, Walker2dEnv, name="walker2d", id="ada/Walker2d-v0"):
     episode_steps = 1000
     search = Search(
         searches=1,
-        ars=ArsSettings(iterations=300, directions=16, top=8, noise=0.025),
+        ars=ArsSettings(iterations=150, directions=16, top=8, noise=0.025),
         practice={"_healthy_reward": 0.0},  # else it learns to stand
         keeps_run=True,
     )
