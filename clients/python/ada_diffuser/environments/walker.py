@@ -17,8 +17,9 @@ class Walker2d(Task, Walker2dEnv, name="walker2d", id="ada/Walker2d-v0"):
 
         r = v + 1 (unless it has fallen) - .001 a.a, v in m/s                   1000 steps of .008 s, fewer where it falls
 
-    Its expert is the best policy of one search of 150 iterations, 4800 episodes; it is linear. On 48 fresh episodes it earns 2919 ± 38 without
-    noise and 2294 ± 113 with that of the data, where D4RL's expert has 4592; the policy of iteration 120 earns a third (876 ± 26, 60 episodes).
+    Its expert is the best policy of one search of 150 iterations, 4800 episodes; it is linear. On 48 fresh episodes it earns 2919 ± 38
+    without noise and 2294 ± 113 with that of the data, where D4RL's expert has 4592; the policy of iteration 120 earns a third, 876 ± 26 in
+    60 episodes.
 
     Args:
         render_mode: `rgb_array` or None.
