@@ -123,7 +123,7 @@ def _check_fit(env: gym.Env, expert: Expert) -> None:
         return
     wanted = env.observation_space.shape[0], env.action_space.shape[0]
     if made_for != wanted:
-        raise ValueError(f"the expert is made for observations and actions of {made_for} numbers, the environment has {wanted}")
+        raise ValueError(f"the expert is made for observations and actions of {made_for} numbers, {env.spec.id} has {wanted}")
 
 
 def _context(env: gym.Env) -> np.ndarray | None:
