@@ -95,6 +95,8 @@ def test_what_a_method_takes_is_told(address: str) -> None:
             assert chunk.value is not None and chunk.value_spread > 0.0 and chunk.evaluations == 8 * chunk.passes
         told = {scale: act("told-return", SamplerOptions(**cold, told_return=-0.1, free_guidance_scale=scale)) for scale in (0.0, 1.0, 3.0)}
         assert not np.array_equal(told[0.0], told[1.0]) and not np.array_equal(told[1.0], told[3.0])
+        goals = [act("told-goal", SamplerOptions(**cold, told_goal=goal)) for goal in ((-1.0, 0.0), (1.0, 0.0))]
+        assert not np.array_equal(*goals)
         truth = [act("oracle", SamplerOptions(**cold), context=[[wind, 0.0]]) for wind in (-4.0, 4.0)]
         assert not np.array_equal(*truth)
         for method, options, field in [
@@ -102,6 +104,8 @@ def test_what_a_method_takes_is_told(address: str) -> None:
             ("plain", {"candidates": 2, "streaming": False}, "options.candidates"),
             ("plain", {"told_return": 1.0}, "options.told_return"),
             ("told-return", {"told_goal": [1.0]}, "options.told_goal"),
+            ("told-goal", {"told_goal": [1.0]}, "options.told_goal"),
+            ("told-goal", {"free_guidance_scale": 1.2}, "options.free_guidance_scale"),
             ("guided", {"candidates": 2, "streaming": True}, "options.candidates"),
         ]:
             with pytest.raises(InvalidInput) as refused:

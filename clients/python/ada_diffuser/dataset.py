@@ -29,6 +29,7 @@ class Episodes:
         context: (N, context), float32; what was hidden while the action was executed; None where the environment tells none.
         blind: (N,), bool; whether the episode was flown without sight of the context; None where none was meant to be.
         play: (N,), bool; whether it shows what comes of actions and is nothing to imitate; None where all is to be imitated.
+        goal: (N, columns), float32; what was wanted in the step, in the environment's `goal_columns`; None where it has no goals.
         session: (N,), int64; episodes with the same number follow one another, and what is hidden may outlast them; None where none was
             meant to.
     """
@@ -43,6 +44,7 @@ class Episodes:
     blind: np.ndarray | None = None
     play: np.ndarray | None = None
     session: np.ndarray | None = None
+    goal: np.ndarray | None = None
 
     def returns(self) -> np.ndarray:
         """Undiscounted return of each episode, shape (episodes,), float64."""
@@ -65,9 +67,10 @@ PATHS = {
     "blind": "infos/blind",
     "play": "infos/play",
     "session": "infos/session",
+    "goal": "infos/goal",
 }
 """Field of `Episodes` -> path in the file, in the order of writing."""
-_OPTIONAL = ("context", "action_noise", "blind", "play", "session")
+_OPTIONAL = ("context", "action_noise", "blind", "play", "session", "goal")
 
 
 def episode_returns(rewards: np.ndarray, ends: np.ndarray) -> np.ndarray:
