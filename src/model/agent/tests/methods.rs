@@ -113,8 +113,8 @@ fn of_critics(latents: bool, change: impl FnOnce(&mut ModelConfig)) -> Agent {
 #[test]
 fn critics_choose_among_actions() {
     let mut lesser = [0, 0];
-    for (latents, state) in (0..12).map(|i| (i % 2 == 0, vec![0.4 - 0.9 * i as f32, -0.3 + 0.2 * i as f32, 0.2])) {
-        let agent = of_critics(latents, |_| ());
+    for (latents, width) in (0..16).map(|i: usize| (i.is_multiple_of(2), 8 + i)) {
+        let (agent, state) = (of_critics(latents, |config| config.method.guide = Some(Guide::Critic { width })), vec![0.4, -0.3, 0.2]);
         let options = SamplerOptions { candidates: 16, temperature: 1.0, streaming: false, kappa: 0.0, action_horizon: 1, ..options() };
         let observation = Observation { state: state.clone(), ..Observation::default() };
         let mut acts = [agent.begin(&agent.open(3, &options).unwrap(), &observation).unwrap()];
