@@ -63,7 +63,7 @@ fn forward(c: &mut Criterion) {
         for batch in [1, 32] {
             let (x, latents): (Buffer, Buffer) = (random([batch, T, STATE + ACTION]), random([batch, T, 20]));
             let levels: Vec<f32> = (0..batch * T).map(|i| (i * 7 % 150) as f32).collect();
-            let condition = Given { levels: &levels, latents: Some(&latents), observed: None, told: None };
+            let condition = Given { latents: Some(&latents), ..Given::levels(&levels) };
             c.bench_function(&format!("forward/{name}/batch-{batch}"), |b| {
                 b.iter(|| black_box(networks.denoiser.predict(&x, &condition).expect("predicts")))
             });
@@ -79,14 +79,14 @@ fn value(c: &mut Criterion) {
         let (x, latents): (Buffer, Buffer) = (random([batch, T, STATE + ACTION]), random([batch, T, 20]));
         let levels: Vec<f32> = (0..batch * T).map(|i| (i * 7 % 150) as f32).collect();
         c.bench_function(&format!("value/forward/batch-{batch}"), |b| {
-            let given = Given { levels: &levels, latents: Some(&latents), observed: None, told: None };
+            let given = Given { latents: Some(&latents), ..Given::levels(&levels) };
             b.iter(|| black_box(network.predict(&x, &given).expect("predicts")))
         });
         c.bench_function(&format!("value/gradient/batch-{batch}"), |b| {
             b.iter(|| {
                 let run = |[x]: [Traced; 1]| {
                     let latents = Traced::constant(latents.clone())?;
-                    network.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None, told: None })
+                    network.predict(&x, &Given { latents: Some(&latents), ..Given::levels(&levels) })
                 };
                 black_box(gradient([x.clone()], run, |_, grad| grad.fill(1.0)).expect("has a way back"))
             })
@@ -172,6 +172,7 @@ fn train_step(c: &mut Criterion) {
             told: None,
             truth: None,
             returns: None,
+            chance: None,
         };
         let options = RefineOptions { routing: LatentRouting::Matched, first_action_weight: 10.0, sub_steps: 1, moves_latents: true };
         c.bench_function(&format!("train-step/{name}/batch-{batch_size}"), |b| {

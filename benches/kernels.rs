@@ -3,7 +3,7 @@
 
 use ada_diffuser::model::nn::kernels::{
     activation::{self, Activation},
-    attention::Attention,
+    attention::{Attention, Grads, Looks},
     convolution::{ConvShape, Convolution},
     norm::{self, Norm, NormGrads},
 };
@@ -86,10 +86,13 @@ fn elementwise(c: &mut Criterion) {
 /// 42 tokens, 8 heads of 32: the DiT's.
 fn attention(c: &mut Criterion) {
     let mut group = c.benchmark_group("attention");
-    let (plan, qkv, grad) = (Attention { batch: 1, steps: 42, heads: 8, head_dim: 32 }, values(42 * 768), values(42 * 256));
+    let plan = Attention { batch: 1, queries: 42, keys: 42, heads: 8, head_dim: 32, causal: false };
+    let (qkv, grad) = (values(42 * 768), values(42 * 256));
     let (mut out, mut dqkv) = (grad.clone(), qkv.clone());
-    group.bench_function("forward", |b| b.iter(|| plan.forward(black_box(&qkv), &mut out)));
-    group.bench_function("backward", |b| b.iter(|| plan.backward(black_box(&qkv), &grad, &mut dqkv)));
+    group.bench_function("forward", |b| b.iter(|| plan.forward(&Looks::together(black_box(&qkv), 256), &mut out)));
+    group.bench_function("backward", |b| {
+        b.iter(|| plan.backward(&Looks::together(black_box(&qkv), 256), &grad, &mut Grads::Together(&mut dqkv)));
+    });
     group.finish();
 }
 

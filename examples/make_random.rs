@@ -3,6 +3,7 @@
 //!     cargo run --release --example make_random -- --out out/models/wide --widths 32,64,128,256
 //!     cargo run --release --example make_random -- --out out/models/dit --net dit --width 256 --depth 2 --heads 8
 //!     cargo run --release --example make_random -- --out out/models/led --guide-widths 32,64 --told-return
+//!     cargo run --release --example make_random -- --out out/models/idql --net idql --latent-dim 0
 
 #[path = "shared/random_weights.rs"]
 mod random_weights;
@@ -10,7 +11,7 @@ mod random_weights;
 use ada_diffuser::model::{
     checkpoint,
     config::{Defaults, ModelConfig, Restart},
-    method::{Backbone, GruLatent, Guide, Looks, Told},
+    method::{AlphaBar, Backbone, Diffused, GruLatent, Guide, Looks, Schedule, Target, Told},
     normalizer::Affine,
     options::SamplerOptions,
     trajectory::Layout,
@@ -80,6 +81,8 @@ enum Net {
     Unet,
     /// Diffusion transformer.
     Dit,
+    /// The actor of IDQL, one action at a time, with critics that choose among 64: of the original's sizes.
+    Idql,
 }
 
 impl Flags {
@@ -87,6 +90,7 @@ impl Flags {
         let backbone = match self.net {
             Net::Unet => Backbone::Unet { widths: self.widths.clone() },
             Net::Dit => Backbone::dit(self.width, self.depth, self.heads),
+            Net::Idql => Backbone::Mlp { width: 256, depth: 3, dropout: 0.1 },
         };
         let looks = Looks::Block(self.block_len);
         let latent = (self.latent_dim > 0).then_some(GruLatent::plain(self.latent_dim, self.hidden, looks));
@@ -95,14 +99,28 @@ impl Flags {
         (config.method.plan.horizon, config.method.plan.level_max) = (self.plan_horizon, self.level_max);
         config.method.guide = self.guide_widths.clone().map(|widths| Guide::Value { widths });
         config.method.told = self.told_return.then_some(Told::Return).into_iter().collect();
-        config.units.returns = config.method.asks_for_returns().then(|| Affine::identity(1));
         config.defaults = Defaults {
             sampler: SamplerOptions { temperature: 0.0, ..SamplerOptions::default() },
             // Finite, since JSON has no infinity, and out of reach.
             restart: Restart { renoise_distance: 1e6, cold_distance: 1e7, latent_jump: 1e30, ..Restart::default() },
         };
+        if matches!(self.net, Net::Idql) {
+            choosing(&mut config);
+        }
+        config.units.returns = config.method.asks_for_returns().then(|| Affine::identity(1));
         config
     }
+}
+
+/// One action in five evaluations, and critics that choose.
+fn choosing(config: &mut ModelConfig) {
+    let plan = &mut config.method.plan;
+    (plan.diffused, plan.horizon, plan.level_max) = (Diffused::Action, 1, 5);
+    (plan.alpha, plan.target, plan.schedule) = (AlphaBar::VpLinear, Target::Eps, Schedule::Uniform { steps: 5 });
+    config.method.guide = Some(Guide::Critic { width: 256 });
+    (config.trained.action_horizons, config.trained.refined) = (vec![1], false);
+    config.defaults.sampler =
+        SamplerOptions { candidates: 64, eta: 1.0, temperature: 1.0, kappa: 0.0, streaming: false, ..SamplerOptions::default() };
 }
 
 fn main() -> anyhow::Result<()> {

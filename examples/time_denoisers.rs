@@ -8,7 +8,7 @@ use ada_diffuser::model::{
     Networks,
     config::ModelConfig,
     denoiser::{Denoiser, Given},
-    method::{Backbone, GruLatent, Looks},
+    method::{Backbone, Diffused, Diffusion, GruLatent, Looks},
     nn::{Activations, Buffer, Form, Layer, Params, Precision},
     noise::Philox,
     trajectory::Layout,
@@ -33,10 +33,10 @@ struct Flags {
     /// Widths of the U-Net, by depth.
     #[arg(long, value_delimiter = ',', default_value = "32,64,64,64")]
     widths: Vec<usize>,
-    /// Width of the DiT; its heads are 32 wide.
+    /// Width of the transformers; their heads are 32 wide.
     #[arg(long, default_value_t = 256)]
     width: usize,
-    /// Blocks of the DiT.
+    /// Blocks of the transformers.
     #[arg(long, default_value_t = 2)]
     depth: usize,
     /// Positions of a window.
@@ -63,6 +63,8 @@ struct Flags {
 enum Net {
     Unet,
     Dit,
+    /// A policy of actions alone: encoder and decoder, with one real step to read.
+    Dp,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -99,7 +101,11 @@ fn main() -> anyhow::Result<()> {
         What::Bound => "bound",
         What::Train => "train",
     };
-    let net = if matches!(flags.net, Net::Unet) { "unet" } else { "dit" };
+    let net = match flags.net {
+        Net::Unet => "unet",
+        Net::Dit => "dit",
+        Net::Dp => "dp",
+    };
     let widths = flags.widths.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
     println!(
         r#"{{"what":"{what}","net":"{net}","widths":"{widths}","len":{},"batch":{},"threads":{},"ms":{ms:.4}}}"#,
@@ -112,10 +118,16 @@ fn config(flags: &Flags) -> ModelConfig {
     let backbone = match flags.net {
         Net::Unet => Backbone::Unet { widths: flags.widths.clone() },
         Net::Dit => Backbone::dit(flags.width, flags.depth, flags.width / 32),
+        Net::Dp => {
+            Backbone::EncoderDecoder { width: flags.width, depth: flags.depth, heads: flags.width / 32, encoder_depth: 0, dropout: 0.0 }
+        }
     };
     let latent = GruLatent::plain(LATENT, 64, Looks::Block(4));
     let mut config = ModelConfig::plain(LAYOUT, Some(latent), backbone);
     (config.method.plan.horizon, config.method.plan.level_max) = (flags.len, LEVELS);
+    if matches!(flags.net, Net::Dp) {
+        config.method.plan.diffused = Diffused::Action;
+    }
     config
 }
 
@@ -131,12 +143,13 @@ fn frozen(config: &ModelConfig, weights: Weights) -> anyhow::Result<Networks> {
 fn forward<V: Activations>(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
     let networks = frozen(config, flags.weights)?;
     let shape = (flags.batch.div_ceil(flags.threads), flags.len);
-    let alone = median(rounds::<V>(&networks.denoiser, shape, &Barrier::new(1), 10)?);
+    let (plan, net) = (&config.method.plan, &networks.denoiser);
+    let alone = median(rounds::<V>((net, plan), shape, &Barrier::new(1), 10)?);
     let (count, meet) = ((flags.seconds * 1e3 / alone) as usize + 10, Barrier::new(flags.threads));
     std::thread::scope(|scope| {
-        let (net, meet) = (&networks.denoiser, &meet);
-        let others: Vec<_> = (1..flags.threads).map(|_| scope.spawn(move || rounds::<V>(net, shape, meet, count))).collect();
-        let times = rounds::<V>(net, shape, meet, count);
+        let meet = &meet;
+        let others: Vec<_> = (1..flags.threads).map(|_| scope.spawn(move || rounds::<V>((net, plan), shape, meet, count))).collect();
+        let times = rounds::<V>((net, plan), shape, meet, count);
         for other in others {
             other.join().map_err(|_| anyhow::anyhow!("a thread ended by panic"))??;
         }
@@ -145,13 +158,19 @@ fn forward<V: Activations>(flags: &Flags, config: &ModelConfig) -> anyhow::Resul
 }
 
 /// Milliseconds of each round, from the moment all threads meet until each has evaluated its windows.
-fn rounds<V: Activations>(net: &Denoiser, (batch, len): (usize, usize), meet: &Barrier, count: usize) -> anyhow::Result<Vec<f64>> {
-    let (x, latents): (V, V) = (normals([batch, len, LAYOUT.dim()])?, normals([batch, len, LATENT])?);
+fn rounds<V: Activations>(
+    (net, plan): (&Denoiser, &Diffusion),
+    (batch, len): (usize, usize),
+    meet: &Barrier,
+    count: usize,
+) -> anyhow::Result<Vec<f64>> {
+    let (x, latents): (V, V) = (normals([batch, len, plan.width(LAYOUT.widths())])?, normals([batch, len, LATENT])?);
+    let observed = observed(plan, batch)?;
     let levels: Vec<f32> = (0..batch * len).map(|i| (i * 7 % LEVELS) as f32).collect();
     let round = |_| {
         meet.wait();
         let begin = Instant::now();
-        net.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None, told: None })?;
+        net.predict(&x, &Given { latents: Some(&latents), observed: observed.as_ref(), ..Given::levels(&levels) })?;
         meet.wait();
         Ok(begin.elapsed().as_secs_f64() * 1e3)
     };
@@ -191,15 +210,18 @@ fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
     let networks = Networks::new(config.layout, &config.method, &params)?;
     let vars = params.vars();
     let mut adam = Adam::new(&vars, |_| Some(0), 0.0, f64::INFINITY);
+    let (plan, share) = (&config.method.plan, flags.batch / flags.threads);
+    let observed: Option<Tensor> = observed(plan, share)?;
     let shards: Vec<(Tensor, Tensor, Tensor)> = (0..flags.threads)
         .map(|_| {
-            let shape = |width| [flags.batch / flags.threads, flags.len, width];
-            Ok((normals(shape(LAYOUT.dim()))?, normals(shape(LATENT))?, normals(shape(LAYOUT.dim()))?))
+            let (shape, width) = (|width| [share, flags.len, width], plan.width(LAYOUT.widths()));
+            Ok((normals(shape(width))?, normals(shape(LATENT))?, normals(shape(width))?))
         })
         .collect::<anyhow::Result<_>>()?;
     let gradient = |(x, latents, target): &(Tensor, Tensor, Tensor)| -> anyhow::Result<GradStore> {
         let levels: Vec<f32> = (0..x.dim(0)? * flags.len).map(|i| (i * 7 % LEVELS) as f32).collect();
-        let y = networks.denoiser.predict(x, &Given { levels: &levels, latents: Some(latents), observed: None, told: None })?;
+        let given = Given { latents: Some(latents), observed: observed.as_ref(), ..Given::levels(&levels) };
+        let y = networks.denoiser.predict(x, &given)?;
         Ok((y - target)?.sqr()?.mean_all()?.affine(1.0 / flags.threads as f64, 0.0)?.backward()?)
     };
     let gradient = &gradient;
@@ -212,6 +234,12 @@ fn train(flags: &Flags, config: &ModelConfig) -> anyhow::Result<f64> {
         times.push(begin.elapsed().as_secs_f64() * 1e3);
     }
     Ok(median(times))
+}
+
+/// The real steps that a policy reads.
+fn observed<V: Activations>(plan: &Diffusion, batch: usize) -> anyhow::Result<Option<V>> {
+    let [steps, width] = plan.observed(LAYOUT.widths());
+    (steps > 0).then(|| normals([batch, 1, steps * width])).transpose()
 }
 
 fn normals<V: Activations>(shape: [usize; 3]) -> anyhow::Result<V> {

@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from ada_diffuser import environments
-from ada_diffuser.collect import returns_summary
+from ada_diffuser.dataset import returns_summary
 from ada_diffuser.experts import Expert, formula_of, kept_expert, load_expert, recipe_for
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, metavar="N", help="of a search (default: as the environment's class says)")
     parser.add_argument("--json", type=Path, default=ROOT / "docs/worlds.json", metavar="FILE", help="(default docs/worlds.json)")
     flags = parser.parse_args()
-    for name in flags.names or environments.NAMES:
+    for name in flags.names or environments.hidden():
         for kind in [flags.only] if flags.only else ("aware", "blind"):
             row = measured(name, expert_of(name, flags, blind=kind == "blind"), flags.episodes) | {"expert": kind}
             write([row], flags.json)

@@ -23,6 +23,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 MODES = ("eager", "jit", "compile")
+# Of HalfCheetah: an action, a latent, the embedding of a level; a real step as a policy reads it.
+ACTION, LATENT, LEVEL, READ = 6, 20, 16, 24
 
 
 def sinusoid(k: Tensor, dim: int) -> Tensor:
@@ -132,6 +134,36 @@ class DiT(nn.Module):
         return self.out(self.norm(x) * (1 + scale) + shift)
 
 
+class Policy(nn.Module):
+    """The transformer of diffusion policy (Chi et al. 2023), (B, T, d_in) -> (B, T, d_out), that reads the mean level and one real step."""
+
+    def __init__(self, d_in: int, d_out: int, horizon: int, batch: int, d: int = 256, depth: int = 2) -> None:
+        super().__init__()
+        self.d, self.inp, self.read = d, nn.Linear(d_in, d), nn.Linear(READ, d)
+        self.places, self.read_places = nn.Parameter(torch.randn(1, horizon, d)), nn.Parameter(torch.randn(1, 2, d))
+        self.encoder = nn.Sequential(nn.Linear(d, 4 * d), nn.Mish(), nn.Linear(4 * d, d))
+        layer = nn.TransformerDecoderLayer(d, d // 32, 4 * d, 0.0, "gelu", batch_first=True, norm_first=True)
+        self.decoder = nn.TransformerDecoder(layer, depth)
+        self.norm, self.out = nn.LayerNorm(d), nn.Linear(d, d_out)
+        self.register_buffer("seen", torch.randn(batch, 1, READ))
+        self.register_buffer("mask", nn.Transformer.generate_square_subsequent_mask(horizon))
+
+    def forward(self, x: Tensor, levels: Tensor) -> Tensor:
+        read = torch.cat([sinusoid(levels.float().mean(1), self.d)[:, None], self.read(self.seen)], 1) + self.read_places
+        h = self.decoder(self.inp(x) + self.places, self.encoder(read), tgt_mask=self.mask, tgt_is_causal=True)
+        return self.out(self.norm(h))
+
+
+def network(a: argparse.Namespace) -> tuple[nn.Module, int, int]:
+    """That which is asked for, and what goes in and out."""
+    if a.net == "dp":
+        d_in = ACTION + LATENT + LEVEL
+        return Policy(d_in, ACTION, a.len, a.batch), d_in, ACTION
+    if a.net == "dit":
+        return DiT(a.d_in, a.d_out), a.d_in, a.d_out
+    return TemporalUNet(a.d_in, a.d_out, [int(width) for width in a.widths.split(",")]), a.d_in, a.d_out
+
+
 def median_ms(run: Callable[[], object], runs: int, warm: int) -> float:
     """Median time of one call after `warm` calls."""
     for _ in range(warm):
@@ -188,7 +220,7 @@ def write_golden(net: nn.Module, x: Tensor, levels: Tensor, path: str) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["time", "train", "golden"])
-    parser.add_argument("--net", choices=["unet", "dit"], default="unet")
+    parser.add_argument("--net", choices=["unet", "dit", "dp"], default="unet")
     parser.add_argument("--widths", default="32,64,64,64")
     parser.add_argument("--d-in", type=int, default=59, help="x 23 + latent 20 + level embedding 16 (HalfCheetah)")
     parser.add_argument("--d-out", type=int, default=23)
@@ -206,14 +238,14 @@ def main() -> None:
     a = _parser().parse_args()
     torch.manual_seed(0)
     torch.set_num_threads(a.threads)
-    net = TemporalUNet(a.d_in, a.d_out, [int(width) for width in a.widths.split(",")]) if a.net == "unet" else DiT(a.d_in, a.d_out)
-    x, levels = torch.randn(a.batch, a.len, a.d_in), torch.randint(0, 150, (a.batch, a.len))
+    net, d_in, d_out = network(a)
+    x, levels = torch.randn(a.batch, a.len, d_in), torch.randint(0, 150, (a.batch, a.len))
     facts = {"net": a.net, "widths": a.widths, "len": a.len, "batch": a.batch, "threads": a.threads}
     facts["params"] = sum(parameter.numel() for parameter in net.parameters())
     if a.what == "golden":
         write_golden(net, x, levels, a.out)
     elif a.what == "train":
-        step = train_step(net, x, levels, a.d_out)
+        step = train_step(net, x, levels, d_out)
         print(json.dumps({**facts, "mode": "eager, Adam", "ms": median_ms(step, max(10, a.runs // 5), 3)}))
     else:
         net.eval()

@@ -113,6 +113,10 @@ def _nets(batch: int, threads: int) -> list[Net]:
     ]
 
 
+def _policy(batch: int, threads: int) -> Net:
+    return Net("transformer of diffusion policy 256x2, 16 positions", "dp", "", 16, batch, threads)
+
+
 def _ours(net: Net, what: str, settings: Settings) -> Figures:
     line = run(TIME_DENOISERS, *net.flags(), "--what", what, "--seconds", settings.net_seconds)[0]
     return {"bare products" if what == "bound" else "ada": {"ms": float(line["ms"])}}
@@ -131,6 +135,11 @@ def _forward() -> Iterator[Trial]:
             yield Trial(
                 "forward", goal.text, (goal,), lambda s, _, net=net: (lambda: _theirs(net, "time", s), lambda: _ours(net, "forward", s))
             )
+    for net, target in ((_policy(1, 1), 3.0), (_policy(32, 2), 2.2)):
+        goal = Goal(f"forward {net.name()}", "ms", "ms", "times faster", target)
+        yield Trial(
+            "forward", goal.text, (goal,), lambda s, _, net=net: (lambda: _theirs(net, "time", s), lambda: _ours(net, "forward", s))
+        )
     wide = _nets(32, 1)[1]
     goal = Goal(f"forward {wide.name()}: share of the bare products", "ms", "ms", "share", 75)
     yield Trial("forward", goal.text, (goal,), lambda s, _: (lambda: _ours(wide, "bound", s), lambda: _ours(wide, "forward", s)))
@@ -191,6 +200,11 @@ class Act:
     # Of its session, and of their function.
     options: tuple[str, ...]
     evaluations: int
+    # Times faster.
+    target: float = 8.0
+    # Their program.
+    script: str = "torch_acts.py"
+    temperature: float = 0.5
 
 
 VALUE = ("--guide-widths", "32,64")
@@ -198,12 +212,13 @@ ACTS = (
     Act("guided act, 16 evaluations, a value gradient in each", VALUE, ("guidance_scale=1.5",), 16),
     Act("free-guided act, 16 evaluations of 2 rows", ("--told-return",), ("told_return=1", "free_guidance_scale=1.2"), 32),
     Act("act of 64 candidates, 16 evaluations of 64 rows", VALUE, ("candidates=64",), 1024),
+    Act("act of IDQL, 5 evaluations of 64 rows", ("--net", "idql"), ("candidates=64",), 320, 10.0, "torch_idql.py", 1.0),
 )
 
 
 def _act() -> Iterator[Trial]:
     for act in ACTS:
-        goal = Goal(f"{act.text}, 1 client, p50", "p50", "ms", "times faster", 8)
+        goal = Goal(f"{act.text}, 1 client, p50", "p50", "ms", "times faster", act.target)
         yield Trial("act", goal.text, (goal,), lambda s, stack, act=act: _against_a_function(act, s, stack))
 
 
@@ -214,12 +229,12 @@ def _against_a_function(act: Act, settings: Settings, stack: ExitStack) -> tuple
     models = Path(stack.enter_context(TemporaryDirectory()))
     run(MAKE_RANDOM, "--out", models / "acting", "--widths", NARROW, "--latent-dim", 0, *act.flags)
     server = stack.enter_context(ada_server(models, "acting"))
-    options = [word for option in (*act.options, "temperature=0.5") for word in ("--set", option)]
+    options = [word for option in (*act.options, f"temperature={act.temperature}") for word in ("--set", option)]
     common = ("--model", models / "acting", *options, "--seconds", settings.seconds)
     theirs: list[dict[str, Any]] = []
 
     def ask_theirs() -> Figures:
-        theirs[:] = [line for line in peer("torch_acts.py", *common, "--modes", settings.modes) if "ms" in line]
+        theirs[:] = [line for line in peer(act.script, *common, "--modes", settings.modes) if "ms" in line]
         return {str(line["mode"]): {"p50": float(line["ms"])} for line in theirs}
 
     def ask_ours() -> Figures:

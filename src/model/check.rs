@@ -126,11 +126,14 @@ impl ModelConfig {
     /// What leads a window, and what chooses among several.
     fn check_guidance(&self, options: &SamplerOptions) -> Result<(), Wrong> {
         let SamplerOptions { streaming, guidance_scale, guidance_samples, candidates, pick_temperature, .. } = options;
-        let guided = self.method.guide.is_some();
+        let (guided, leads) = (self.method.guide.is_some(), self.method.guide.as_ref().is_some_and(Guide::leads));
         let scale = (0.0..=SCALE_MAX).contains(guidance_scale);
         holds(scale, "guidance_scale", &|| format!("{guidance_scale} is outside 0..={SCALE_MAX}"))?;
         let untrained = || "this checkpoint has no guide (`model.guide` of a recipe)".to_string();
         holds(guided || *guidance_scale == 0.0, "guidance_scale", &|| format!("{}; only 0 is allowed", untrained()))?;
+        holds(leads || *guidance_scale == 0.0, "guidance_scale", &|| {
+            "this checkpoint's critic chooses among candidates and leads none; only 0 is allowed".into()
+        })?;
         let samples = *guidance_samples <= SAMPLES_MAX;
         holds(samples, "guidance_samples", &|| format!("{guidance_samples} is outside 0..={SAMPLES_MAX}"))?;
         holds(*guidance_samples == 0 || *guidance_scale > 0.0, "guidance_samples", &|| "needs a guidance_scale above 0".into())?;
@@ -174,7 +177,7 @@ impl ModelConfig {
         size("layout.state_dim", self.layout.state_dim, COLUMNS_MAX)?;
         size("layout.action_dim", self.layout.action_dim, COLUMNS_MAX)?;
         let Method { latent, plan, head, guide, told, discount } = &self.method;
-        let Diffusion { horizon, obs_horizon, level_max, diffused, target: _, schedule, backbone: _, clip } = plan;
+        let Diffusion { horizon, obs_horizon, level_max, alpha: _, diffused, target: _, schedule, backbone: _, clip } = plan;
         size("method.plan.horizon", *horizon, HORIZON_MAX)?;
         size("method.plan.obs_horizon", *obs_horizon, HISTORY_MAX)?;
         size("method.plan.level_max", *level_max, LEVEL_MAX_MAX)?;
@@ -213,6 +216,10 @@ impl ModelConfig {
                 }
             }
         }
+        let held = latent.gru().is_some() && !self.method.can_refine() && schedule.is_ladder();
+        let single = *diffused != Diffused::Action || !held || self.trained.action_horizons == [1];
+        let reason = "of a policy on a ladder whose belief is held must be [1]: the belief of a later action would be one without a state";
+        require(single, "trained.action_horizons", reason)?;
         denoiser::check(plan)?;
         require(clip.is_finite() && *clip > 0.0, "method.plan.clip", format!("is {clip}, must be positive and finite"))
     }
@@ -251,8 +258,8 @@ impl ModelConfig {
 /// Actions are part of the plan, or found by inverse dynamics.
 fn check_head(diffused: Diffused, head: &Head, latent: &LatentSource) -> Result<(), Unfit> {
     match (diffused, head) {
-        (Diffused::StateAction, Head::Direct) => Ok(()),
-        (Diffused::StateAction, Head::Inverse { .. }) => {
+        (Diffused::StateAction | Diffused::Action, Head::Direct) => Ok(()),
+        (Diffused::StateAction | Diffused::Action, Head::Inverse { .. }) => {
             require(false, "method.head", "must be direct where actions are diffused: they are there already")
         }
         (Diffused::State, Head::Direct) => {
@@ -274,7 +281,16 @@ fn check_head(diffused: Diffused, head: &Head, latent: &LatentSource) -> Result<
 fn check_guide(guide: Option<&Guide>, plan: &Diffusion, latent: &LatentSource) -> Result<(), Unfit> {
     match guide {
         None => Ok(()),
-        Some(Guide::Value { widths }) => check_value(widths, plan.horizon),
+        Some(Guide::Value { widths }) => {
+            let sees = plan.diffused != Diffused::Action;
+            require(sees, "method.guide", "value needs windows with states: actions alone do not say where they are taken")?;
+            check_value(widths, plan.horizon)
+        }
+        Some(Guide::Critic { width }) => {
+            let acts = plan.diffused != Diffused::State;
+            require(acts, "method.guide", "critic needs windows with actions, of which it judges the first")?;
+            size("method.guide.width", *width, WIDTH_MAX)
+        }
         Some(Guide::DecoderReturn) => {
             // Beside a baseline the decoder tells what is surprising of a reward, and the rest is not the latent's.
             let tells = latent.gru().is_some_and(|gru| gru.baseline.is_none());

@@ -3,24 +3,27 @@
 use crate::model::{config::Units, method::Diffused, trajectory::Layout};
 use std::ops::Range;
 
-/// Columns of one position of a window (section 4.1 of the paper: type (i) has both, type (ii) states alone).
+/// Columns of one position of a window (section 4.1 of the paper: type (i) has both, type (ii) states alone; a policy actions alone).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Columns {
-    /// s_t.
+    /// s_t; none where actions alone are diffused.
     pub state: Range<usize>,
     /// a_t; none where states alone are diffused.
     pub action: Range<usize>,
+    /// Which columns of a whole step, state and action side by side, these are.
+    pub of_step: Range<usize>,
 }
 
 impl Columns {
     /// Of a window of this kind.
     pub fn new(diffused: Diffused, layout: Layout) -> Self {
         let Layout { state_dim, action_dim } = layout;
-        let actions = match diffused {
-            Diffused::StateAction => action_dim,
-            Diffused::State => 0,
+        let (states, actions, first) = match diffused {
+            Diffused::StateAction => (state_dim, action_dim, 0),
+            Diffused::State => (state_dim, 0, 0),
+            Diffused::Action => (0, action_dim, state_dim),
         };
-        Self { state: 0..state_dim, action: state_dim..state_dim + actions }
+        Self { state: 0..states, action: states..states + actions, of_step: first..first + states + actions }
     }
 
     /// State and action side by side.

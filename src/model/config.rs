@@ -1,7 +1,7 @@
 //! What a model is, apart from its weights: the content of a checkpoint's `config.json`.
 
 use crate::model::{
-    method::{Backbone, Diffused, Diffusion, GruLatent, LatentSource, Method, Schedule, Target},
+    method::{AlphaBar, Backbone, Diffused, Diffusion, GruLatent, LatentSource, Method, Schedule, Target},
     normalizer::{Affine, Normalizer},
     options::{SamplerOptions, infinity_as_null},
     trajectory::Layout,
@@ -127,7 +127,8 @@ impl ModelConfig {
     /// be said: where tests, benches and examples start.
     pub fn plain(layout: Layout, latent: Option<GruLatent>, backbone: Backbone) -> Self {
         let (diffused, target, schedule) = (Diffused::StateAction, Target::X0, Schedule::LADDER);
-        let plan = Diffusion { horizon: 8, obs_horizon: 1, level_max: 40, diffused, target, schedule, backbone, clip: 5.0 };
+        let alpha = AlphaBar::Cosine;
+        let plan = Diffusion { horizon: 8, obs_horizon: 1, level_max: 40, alpha, diffused, target, schedule, backbone, clip: 5.0 };
         Self {
             layout,
             method: Method::plain(latent.map_or(LatentSource::None, LatentSource::Gru), plan),

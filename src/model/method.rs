@@ -2,10 +2,12 @@
 //! (section 4 of the paper; the baselines of its section 5 are other values of the same choices).
 
 mod latent;
+mod plan;
 
 use serde::{Deserialize, Serialize};
 
 pub use latent::{Actions, Baseline, Future, GruLatent, LatentSource, Looks, TrueFuture};
+pub use plan::{AlphaBar, Backbone, Diffused, Diffusion, History, RungMap, Schedule, Target};
 
 /// A method of acting.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -103,6 +105,22 @@ pub enum Guide {
     },
     /// The rewards that the latent's decoder tells of the window's steps: no further network ("computed return" of the paper).
     DecoderReturn,
+    /// Critics of the first action, learned from what came of actions (implicit Q-learning, Kostrikov et al. 2022; as IDQL, Hansen-Estruch et
+    /// al. 2023, they choose among candidates and lead none).
+    Critic {
+        /// Of two hidden layers.
+        width: usize,
+    },
+}
+
+impl Guide {
+    /// Whether its gradient leads a window on its way down.
+    pub fn leads(&self) -> bool {
+        match self {
+            Self::Value { .. } | Self::DecoderReturn => true,
+            Self::Critic { .. } => false,
+        }
+    }
 }
 
 /// What a session may tell.
@@ -128,171 +146,6 @@ impl Told {
     }
 }
 
-/// A diffusion model over windows of a trajectory.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Diffusion {
-    /// Generated positions of the window (T).
-    pub horizon: usize,
-    /// Real steps the denoiser itself sees (T_o); 1 is the current state alone, which is always inpainted.
-    pub obs_horizon: usize,
-    /// Number of diffusion levels (K).
-    pub level_max: usize,
-    /// What a window is made of.
-    #[serde(default, skip_serializing_if = "Diffused::is_state_action")]
-    pub diffused: Diffused,
-    /// What the denoiser predicts.
-    #[serde(default, skip_serializing_if = "Target::is_x0")]
-    pub target: Target,
-    /// The way down from noise.
-    #[serde(default)]
-    pub schedule: Schedule,
-    /// The denoiser.
-    pub backbone: Backbone,
-    /// Bound of denoised states, in standard deviations of the data.
-    pub clip: f32,
-}
-
-/// What a position of a window is made of.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Diffused {
-    /// State and action.
-    #[default]
-    StateAction,
-    /// The state alone; position 0, the current one, is known and stands clean in every row.
-    State,
-}
-
-impl Diffused {
-    fn is_state_action(&self) -> bool {
-        *self == Self::StateAction
-    }
-
-    /// The first position that is not wholly known.
-    pub fn first_free(self) -> usize {
-        match self {
-            Self::StateAction => 0,
-            Self::State => 1,
-        }
-    }
-}
-
-/// What the denoiser predicts of a window `x^k = a x0 + b eps`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Target {
-    /// The clean window.
-    #[default]
-    X0,
-    /// The noise (Ho et al. 2020).
-    Eps,
-    /// `a eps - b x0` (Salimans and Ho 2022).
-    V,
-}
-
-impl Target {
-    fn is_x0(&self) -> bool {
-        *self == Self::X0
-    }
-}
-
-/// Which level a rung of the ladder stands at.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum RungMap {
-    /// `k_i = i K / T`.
-    #[default]
-    Linear,
-    /// An S-curve: rungs lie close at both ends. `s(6 (2 i / T - 1))`, brought to 0 and K; s is the logistic function.
-    Logistic,
-    /// A flatter S-curve: the same with 3 in place of 6.
-    Sigmoid,
-}
-
-impl RungMap {
-    fn is_linear(&self) -> bool {
-        *self == Self::Linear
-    }
-}
-
-/// In which order the positions of a window come clean.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
-pub enum Schedule {
-    /// One after the other, each a rung above the one before (section 4.1 of the paper).
-    Ladder {
-        /// The levels of the rungs.
-        #[serde(default, skip_serializing_if = "RungMap::is_linear")]
-        map: RungMap,
-    },
-    /// All at once, in so many evaluations (Janner et al. 2022).
-    Uniform {
-        /// Network evaluations from noise to clean (S).
-        steps: usize,
-    },
-}
-
-impl Default for Schedule {
-    fn default() -> Self {
-        Self::LADDER
-    }
-}
-
-impl Schedule {
-    /// That of the paper: `k_i = i K / T`.
-    pub const LADDER: Self = Self::Ladder { map: RungMap::Linear };
-
-    /// Whether positions come clean one after the other, so that a window is left for the next act.
-    pub fn is_ladder(self) -> bool {
-        match self {
-            Self::Ladder { .. } => true,
-            Self::Uniform { .. } => false,
-        }
-    }
-}
-
-/// The network of a denoiser, and its sizes.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
-pub enum Backbone {
-    /// Temporal U-Net (Janner et al. 2022) with a linear skip from input to output; the horizon must be divisible by `2^(widths - 1)`.
-    Unet {
-        /// Channels of each depth.
-        widths: Vec<usize>,
-    },
-    /// Diffusion transformer (Peebles and Xie 2023), conditioned token by token, with the same skip. Keeps the absolute scale of states
-    /// that group norm over time removes, so it suits states far from the origin.
-    Dit {
-        /// Width of a token.
-        width: usize,
-        /// Number of blocks.
-        depth: usize,
-        /// Attention heads.
-        heads: usize,
-        /// How it is told the real steps before the window.
-        #[serde(default, skip_serializing_if = "History::is_vector")]
-        history: History,
-    },
-}
-
-/// How a transformer is told the real steps before a window.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum History {
-    /// All of them as one vector, added to the condition of each position.
-    #[default]
-    Vector,
-    /// As clean tokens in front of the window, which it can attend to (type (ii) planner of the paper).
-    Tokens,
-}
-
-impl History {
-    fn is_vector(&self) -> bool {
-        *self == Self::Vector
-    }
-}
-
 impl Method {
     /// A planner of states and actions that is told nothing.
     pub fn plain(latent: LatentSource, plan: Diffusion) -> Self {
@@ -309,6 +162,11 @@ impl Method {
         matches!(self.guide, Some(Guide::Value { .. }))
     }
 
+    /// Whether its guide is a critic.
+    pub fn has_critic(&self) -> bool {
+        matches!(self.guide, Some(Guide::Critic { .. }))
+    }
+
     /// Whether anything of it needs the return of a step.
     pub fn asks_for_returns(&self) -> bool {
         self.guide.is_some() || self.told.contains(&Told::Return)
@@ -318,22 +176,5 @@ impl Method {
     /// successor, and a row at which positions 0 and 1 stand alone in front of the others.
     pub fn can_refine(&self) -> bool {
         self.latent.gru().is_some_and(|gru| gru.future == Future::Prior) && self.plan.schedule.is_ladder()
-    }
-}
-
-impl Backbone {
-    /// A transformer that is told the real steps as one vector.
-    pub fn dit(width: usize, depth: usize, heads: usize) -> Self {
-        Self::Dit { width, depth, heads, history: History::Vector }
-    }
-}
-
-impl Diffusion {
-    /// Columns of a position of its window, of so many of states and actions.
-    pub fn width(&self, [state_dim, action_dim]: [usize; 2]) -> usize {
-        match self.diffused {
-            Diffused::StateAction => state_dim + action_dim,
-            Diffused::State => state_dim,
-        }
     }
 }

@@ -7,7 +7,7 @@ use super::{
     recipe::stages::{Group, Stage},
     resume::{KEPT, Kept, Notes, Snapshot, State, restore_vars},
 };
-use crate::model::{Networks, nn::params::Params};
+use crate::model::{Networks, critic::Critic, nn::params::Params};
 use anyhow::{Result, ensure};
 use candle_core::{Tensor, Var};
 use std::collections::BTreeMap;
@@ -123,6 +123,16 @@ impl Learner {
         }
     }
 
+    /// The slow copy of the critics: the average of the stage.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn slow_critic(&self, task: &Task) -> Result<Option<Critic>> {
+        let Some(ema) = &self.ema else { return Ok(None) };
+        let tensors = ema.tensors_of(Group::Critic.prefix(), &self.vars)?;
+        Ok(Networks::critic(task.config.layout, &task.config.method, &Params::loaded(tensors))?)
+    }
+
     /// The averaged networks and their tensors: what is shipped.
     ///
     /// # Errors
@@ -161,12 +171,14 @@ mod tests {
         let LatentSource::Gru(gru) = &mut recipe.model.latent else { panic!("a latent") };
         gru.baseline = Some(Baseline { width: 4 });
         recipe.model.head = Head::Inverse { network: Inverse::Mlp { width: 4 }, latent: true };
-        recipe.model.guide = Some(Guide::Value { widths: vec![8] });
-        let config = recipe.config(Layout { state_dim: 3, action_dim: 2 });
-        let params = Params::fresh(0);
-        Networks::new(config.layout, &config.method, &params).unwrap();
-        let groups: std::collections::BTreeSet<_> =
-            params.vars().keys().map(|name| Group::of(name).unwrap_or_else(|| panic!("{name}"))).collect();
+        let mut groups = std::collections::BTreeSet::new();
+        for guide in [Guide::Value { widths: vec![8] }, Guide::Critic { width: 4 }] {
+            recipe.model.guide = Some(guide);
+            let config = recipe.config(Layout { state_dim: 3, action_dim: 2 });
+            let params = Params::fresh(0);
+            Networks::new(config.layout, &config.method, &params).unwrap();
+            groups.extend(params.vars().keys().map(|name| Group::of(name).unwrap_or_else(|| panic!("{name}"))));
+        }
         assert_eq!(groups, Group::ALL.into_iter().collect());
     }
 }

@@ -99,7 +99,7 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// Zero moments; `group` sorts names into groups, those of none are not trained.
+    /// Zero moments; `group` sorts names into groups, those of none are not trained. Matrices and kernels decay, vectors do not.
     pub fn new(vars: &BTreeMap<String, Var>, group: impl Fn(&str) -> Option<usize>, weight_decay: f64, clip_norm: f64) -> Self {
         let slot = |(name, var): (&String, &Var)| {
             let zeros = || vec![0.0; var.elem_count()];
@@ -123,7 +123,8 @@ impl Adam {
         self.steps += 1;
         let scale = if norm > self.clip_norm { (self.clip_norm / norm) as f32 } else { 1.0 };
         let (weight_decay, correction) = (self.weight_decay, [BETA.0, BETA.1].map(|beta| 1.0 - beta.powf(self.steps as f64)));
-        let step = |rate: f64| AdamStep {
+        // Biases, scales and other vectors are where they have to be, not as small as can be.
+        let step = |rate: f64, weight_decay: f64| AdamStep {
             scale,
             beta: (BETA.0 as f32, BETA.1 as f32),
             complement: ((1.0 - BETA.0) as f32, (1.0 - BETA.1) as f32),
@@ -134,7 +135,8 @@ impl Adam {
         };
         each_slot(&mut self.slots, |slot| {
             let Slot { var, moments, grad, reached: true, group, .. } = slot else { return Ok(()) };
-            Ok(var.as_tensor().inplace_op1(&Step { step: step(rates[*group]), grad, moments: RefCell::new(moments) })?)
+            let step = step(rates[*group], if var.rank() > 1 { weight_decay } else { 0.0 });
+            Ok(var.as_tensor().inplace_op1(&Step { step, grad, moments: RefCell::new(moments) })?)
         })?;
         Ok(norm)
     }
@@ -246,11 +248,19 @@ impl Ema {
     /// # Errors
     /// If a tensor operation fails.
     pub fn tensors(&self, vars: &BTreeMap<String, Var>) -> Result<BTreeMap<String, Tensor>> {
+        self.tensors_of("", vars)
+    }
+
+    /// Of the variables whose names begin so.
+    ///
+    /// # Errors
+    /// As of [`Self::tensors`].
+    pub fn tensors_of(&self, prefix: &str, vars: &BTreeMap<String, Var>) -> Result<BTreeMap<String, Tensor>> {
         let tensor = |(name, values): (&String, &Vec<f32>)| {
             let var = &vars[name];
             Ok((name.clone(), Tensor::from_slice(values, var.shape(), var.device())?))
         };
-        self.values.iter().map(tensor).collect()
+        self.values.iter().filter(|(name, _)| name.starts_with(prefix)).map(tensor).collect()
     }
 
     /// Takes the average from the training state: `ema.NAME`.
@@ -279,10 +289,16 @@ mod tests {
         var.as_tensor().sqr().unwrap().sum_all().unwrap().affine(factor, 0.0).unwrap().backward().unwrap()
     }
 
-    /// Two steps of `torch.optim.AdamW(lr=.1, weight_decay=.5)` written out in f64.
+    /// Two steps of `torch.optim.AdamW(lr=.1, weight_decay=.5)` written out in f64: a matrix decays, a vector does not.
     #[test]
     fn adamw_by_hand() {
-        let var = var(&[1.0, -2.0]);
+        for decay in [0.5, 0.0] {
+            let shape = if decay > 0.0 { vec![1, 2] } else { vec![2] };
+            adamw_against(Var::from_slice(&[1.0_f32, -2.0], shape, &Device::Cpu).unwrap(), decay);
+        }
+    }
+
+    fn adamw_against(var: Var, decay: f64) {
         let vars = BTreeMap::from([("w".to_string(), var.clone())]);
         let mut adam = Adam::new(&vars, |_| Some(0), 0.5, f64::INFINITY);
         let mut expected = [1.0_f64, -2.0];
@@ -294,10 +310,10 @@ mod tests {
                 moments[0][i] = 0.9 * moments[0][i] + 0.1 * grad;
                 moments[1][i] = 0.999 * moments[1][i] + 0.001 * grad * grad;
                 let (m, v) = (moments[0][i] / (1.0 - 0.9_f64.powi(step)), moments[1][i] / (1.0 - 0.999_f64.powi(step)));
-                expected[i] = expected[i] * (1.0 - 0.1 * 0.5) - 0.1 * m / (v.sqrt() + 1e-8);
+                expected[i] = expected[i] * (1.0 - 0.1 * decay) - 0.1 * m / (v.sqrt() + 1e-8);
             }
         }
-        let got: Vec<f32> = var.to_vec1().unwrap();
+        let got: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
         for (got, expected) in got.iter().zip(expected) {
             assert!((f64::from(*got) - expected).abs() < 1e-6, "{got} {expected}");
         }

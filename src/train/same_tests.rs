@@ -6,10 +6,11 @@ use super::{
         Episode, Sides, Span,
         beside::Beside,
         hidden::Hide,
+        places::Places,
         returns::Returns,
         room::Room,
         surprises::surprising,
-        window::{Levels, Places, WindowShape, windows},
+        window::{Levels, WindowShape, windows},
     },
     *,
 };
@@ -84,7 +85,7 @@ fn episodes(before: usize) -> Vec<Episode> {
     let mut numbers = |count: usize, scale: f32| (0..count).map(|_| scale * (2.0 * rng.uniform() - 1.0)).collect::<Vec<f32>>();
     let mut episode = || {
         let columns = [numbers(all * 3, 2.0), numbers(all * 2, 1.0), numbers(all, 1.0), numbers(all * 2, 1.0)];
-        Episode::among(LAYOUT, columns, Span { rows: before..all, play: false, before: (before > 0).then_some(0..before) })
+        Episode::among(LAYOUT, columns, Span { rows: before..all, play: false, ended: false, before: (before > 0).then_some(0..before) })
     };
     (0..3).map(|_| episode()).collect()
 }
@@ -152,9 +153,8 @@ fn check_with(agent: &Agent, episodes: &[Episode], config: &ModelConfig, hide: H
     let (sampler, latents_free) = (&config.defaults.sampler, config.method.latent.gru().is_none());
     let shape = WindowShape {
         batch: BATCH,
-        horizon: plan.horizon,
-        looks: config.method.latent.gru().map_or(Looks::Block(plan.obs_horizon), |gru| gru.looks),
-        obs_horizon: plan.obs_horizon,
+        looks: config.method.latent.gru().map_or(Looks::Block(plan.obs_horizon + 2), |gru| gru.looks),
+        plan: plan.clone(),
         table: Table::of(plan, sampler.sub_steps).unwrap(),
         levels: Levels::Schedule,
         action_horizons: if config.trained.refined || latents_free { config.trained.action_horizons.clone() } else { vec![1] },
@@ -195,8 +195,11 @@ fn assert_same(agent: &Agent, one: &WindowBatch, (trained, x_ready): (&[Vec<f32>
     let (imagined, Standing::Row(row)) = (one.imagined[0], one.at[0].clone()) else { panic!("a row") };
     let episode = begun(agent, one, start);
     let (states, actions, len) = (numbers(&one.history.state, 0), numbers(&one.history.action, 0), history_len(one, 0));
-    let whole = agent.config().method.plan.diffused == Diffused::StateAction;
-    let given_out = |i: usize| [&states[3 * i..3 * i + 3], if whole { &actions[2 * i..2 * i + 2] } else { &[] }].concat();
+    let given_out = |i: usize| match agent.config().method.plan.diffused {
+        Diffused::StateAction => [&states[3 * i..3 * i + 3], &actions[2 * i..2 * i + 2]].concat(),
+        Diffused::State => states[3 * i..3 * i + 3].to_vec(),
+        Diffused::Action => actions[2 * i..2 * i + 2].to_vec(),
+    };
     let given: Vec<f32> = (len - imagined.min(len)..len).flat_map(given_out).collect();
     let executed = told(one, 0, start, imagined);
     let context = one.truth.as_ref().map(|truth| numbers(truth, 0).chunks(2).map(<[f32]>::to_vec).collect::<Vec<_>>());
@@ -205,7 +208,12 @@ fn assert_same(agent: &Agent, one: &WindowBatch, (trained, x_ready): (&[Vec<f32>
         rows.truncate(if held { 1 } else { rows.len() });
         rows
     });
-    let observation = Observation { state: numbers(&one.window, 0)[..3].to_vec(), executed, nothing_executed: false, context };
+    // Where states are imagined, the window's first is all that is looked at.
+    let now = match (agent.config().method.plan.diffused, imagined) {
+        (Diffused::Action, 1..) => states[3 * (len - imagined)..][..3].to_vec(),
+        _ => numbers(&one.window, 0)[..3].to_vec(),
+    };
+    let observation = Observation { state: now, executed, nothing_executed: false, context };
     let act = agent.begin(&episode, &observation).unwrap();
     let of_given = &actions[2 * (len - imagined.min(len))..];
     let served = agent.read_in_serving(act, row, [&trained[0], x_ready, &given, &of_given[..2 * imagined]]).unwrap();
@@ -305,6 +313,35 @@ fn windows_of_states() {
     ] {
         let config = of_states(config(latent, schedule, obs_horizon, sub_steps));
         [Hide::NOTHING, hide].into_iter().for_each(|hide| check(&config, hide));
+    }
+}
+
+/// Actions alone: the real steps stand beside the window, and of the window's tokens the current one alone has a state, if it is the real one.
+fn of_actions(mut config: ModelConfig) -> ModelConfig {
+    config.method.plan.diffused = Diffused::Action;
+    if config.method.latent.gru().is_some() && !config.method.can_refine() {
+        (config.trained.action_horizons, config.defaults.sampler.action_horizon) = (vec![1], 1);
+    }
+    config.check().unwrap();
+    config
+}
+
+#[test]
+fn windows_of_actions() {
+    let (ladder, hide) = (Schedule::LADDER, Hide { state: 0.4, action: 0.4, reward: 0.4 });
+    let transformer = Backbone::EncoderDecoder { width: 8, depth: 1, heads: 2, encoder_depth: 1, dropout: 0.1 };
+    for (latent, schedule, obs_horizon, sub_steps) in [
+        (Some((Looks::Block(6), Future::Prior)), ladder, 1, 1),
+        (Some((Looks::Block(6), Future::Prior)), ladder, 3, 2),
+        (Some((Looks::Running, Future::Held)), ladder, 2, 1),
+        (Some((Looks::Running, Future::Prior)), Schedule::Ladder { map: RungMap::Sigmoid }, 1, 1),
+        (None, ladder, 3, 1),
+        (None, Schedule::Uniform { steps: 7 }, 2, 1),
+    ] {
+        let mut config = of_actions(config(latent, schedule, obs_horizon, sub_steps));
+        [Hide::NOTHING, hide].into_iter().for_each(|hide| check(&config, hide));
+        config.method.plan.backbone = transformer.clone();
+        check(&config, hide);
     }
 }
 

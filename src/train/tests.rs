@@ -410,6 +410,9 @@ fn data_sets_are_read_and_split() {
     let digests =
         ["data_good", "data_f64"].map(|file| hdf5::read(Path::new(&format!("tests/golden/{file}.h5")), &Room::default()).unwrap());
     assert_ne!(digests[0].digest, digests[1].digest);
+    // The first half ends because time is up, the second by what happens.
+    let ended: Vec<bool> = digests[0].episodes.iter().map(|span| span.ended).collect();
+    assert_eq!(ended, [[false; 6], [true; 6]].concat());
 }
 
 /// All rows were held in memory, four times over, so a data set larger than that could not be trained on. Kept in a file they give the

@@ -6,9 +6,10 @@
 Writes `networks.safetensors` beside this file. Computed in float64 and rounded once; what is drawn is rounded before, to float16,
 which holds it exactly. Activations are channels last; gradients are those of the sum over the results of `sum(y * r)`. Tensor names:
 `<case>.in.<input>`, `.y.<result>`, `.r.<result>`, `.p.<parameter>`, `.d.<input>`, `.dp.<parameter>`; parameters have the names of a
-checkpoint. The networks are written after the papers, in PyTorch's
-modules: the U-Net of Janner et al. 2022 with the mean level of a window as its time, half of it as the value of a window, the
-transformer of Peebles and Xie 2023 with a level for each token, and the encoder, prior and decoder of the paper's appendix A.4.
+checkpoint. The networks are written after the papers, in PyTorch's modules: the U-Net of Janner et al. 2022 with the mean level of a
+window as its time, half of it as the value of a window, the transformer of Peebles and Xie 2023 with a level for each token, the encoder
+and decoder of Chi et al. 2023 with the same, actor and critics of Hansen-Estruch et al. 2023, and the encoder, prior and decoder of the
+paper's appendix A.4.
 """
 
 from __future__ import annotations
@@ -163,6 +164,159 @@ class ToldDenoiser(nn.Module):
         x = torch.cat([given["x"], given["latents"], sinusoid(given["levels"], Denoiser.LEVEL)], -1)
         steps = given["observed"].unflatten(2, (-1, STATE + ACTION))[:, 0]
         return {"x0": self.backbone(x, given["levels"], self.told(given["told"][:, 0]), steps) + self.input_skip(x)}
+
+
+class Selves(nn.Module):
+    """Pre-norm self-attention, with the residual."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm, self.attention = nn.LayerNorm(width), nn.MultiheadAttention(width, heads, batch_first=True)
+
+    def forward(self, x: Tensor, causal: bool) -> Tensor:
+        h, mask = self.norm(x), nn.Transformer.generate_square_subsequent_mask(x.shape[1]) if causal else None
+        return x + self.attention(h, h, h, need_weights=False, attn_mask=mask, is_causal=causal)[0]
+
+
+class Cross(nn.Module):
+    """Pre-norm attention on other tokens, with the residual."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm, self.heads = nn.LayerNorm(width), heads
+        self.q, self.kv, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
+
+    def forward(self, x: Tensor, others: Tensor) -> Tensor:
+        q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.q(self.norm(x)), *self.kv(others).chunk(2, -1)))
+        return x + self.out(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+
+
+class TransformerBlock(nn.Module):
+    """Of an encoder, or with `cross` of a decoder."""
+
+    def __init__(self, width: int, heads: int, cross: bool) -> None:
+        super().__init__()
+        self.add_module("self", Selves(width, heads))
+        self.cross = Cross(width, heads) if cross else None
+        self.norm = nn.LayerNorm(width)
+        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU("tanh"), nn.Linear(4 * width, width))
+
+    def forward(self, x: Tensor, others: Tensor | None, causal: bool) -> Tensor:
+        x = self.get_submodule("self")(x, causal)
+        x = x if self.cross is None else self.cross(x, others)
+        return x + self.mlp(self.norm(x))
+
+
+def placed(x: Tensor) -> Tensor:
+    """Each step beside its place, as one of so many."""
+    return torch.cat([x, torch.eye(x.shape[1]).expand(x.shape[0], -1, -1)], -1)
+
+
+class EncoderDecoder(nn.Module):
+    """The policy of Chi et al. 2023 with a level and a latent for each position, and the mean level as the time."""
+
+    def __init__(self, d_in: int, d_out: int, steps: tuple[int, int], sizes: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        width, heads, encoder_depth, depth = sizes
+        horizon, observed = steps
+        self.level, self.input, self.reads = nn.Linear(width, width), nn.Linear(d_in + horizon, width), observed > 0
+        if self.reads:
+            self.step = nn.Linear(STATE + ACTION + 1 + observed, width)
+            blocks = [TransformerBlock(width, heads, False) for _ in range(encoder_depth)]
+            each = [nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width)]
+            self.encoder = nn.ModuleList(blocks or each)
+        self.blocks = nn.ModuleList(TransformerBlock(width, heads, self.reads) for _ in range(depth))
+        self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, d_out)
+
+    def forward(self, x: Tensor, levels: Tensor, observed: Tensor | None, told: Tensor | None) -> Tensor:
+        time, h = self.level(sinusoid(levels.mean(1), self.norm.normalized_shape[0]))[:, None], self.input(placed(x))
+        if not self.reads:
+            h = torch.cat([time, h], 1)
+            for block in self.blocks:
+                h = block(h, None, True)
+            return self.out(self.norm(h[:, 1:]))
+        read = torch.cat([time, self.step(placed(observed)), *([] if told is None else [told[:, None]])], 1)
+        for layer in self.encoder:
+            read = layer(read, None, False) if isinstance(layer, TransformerBlock) else layer(read)
+        for block in self.blocks:
+            h = block(h, read, True)
+        return self.out(self.norm(h))
+
+
+class Policy(nn.Module):
+    """That network over window, latents and level embedding, with the linear skip; of actions alone where it is given real steps."""
+
+    def __init__(self, latent: int, told: int, steps: tuple[int, int], sizes: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        d_out = ACTION if steps[1] else STATE + ACTION
+        d_in = d_out + latent + Denoiser.LEVEL
+        self.backbone, self.input_skip = EncoderDecoder(d_in, d_out, steps, sizes), nn.Linear(d_in, d_out)
+        self.told = nn.Sequential(nn.Linear(told + 1, 128), nn.SiLU(), nn.Linear(128, sizes[0])) if told else None
+
+    def forward(self, given: Tensors) -> Tensors:
+        parts = [given["x"], given.get("latents"), sinusoid(given["levels"], Denoiser.LEVEL)]
+        x = torch.cat([part for part in parts if part is not None], -1)
+        observed = given["observed"].unflatten(2, (-1, STATE + ACTION + 1))[:, 0] if "observed" in given else None
+        told = None if self.told is None else self.told(given["told"][:, 0])
+        return {"x0": self.backbone(x, given["levels"], observed, told) + self.input_skip(x)}
+
+
+class ResidualMlp(nn.Module):
+    """MLPResNet of IDQL over a window as one vector."""
+
+    def __init__(self, d_in: int, d_out: int, horizon: int, width: int, depth: int) -> None:
+        super().__init__()
+        self.time = nn.Sequential(nn.Linear(64, 128), nn.Mish(), nn.Linear(128, width))
+        self.input, self.out = nn.Linear(horizon * d_in, width), nn.Linear(width, horizon * d_out)
+        self.blocks = nn.ModuleList(
+            nn.ModuleDict({"norm": nn.LayerNorm(width, eps=1e-6), "0": nn.Linear(width, 4 * width), "2": nn.Linear(4 * width, width)})
+            for _ in range(depth)
+        )
+
+    def forward(self, x: Tensor, levels: Tensor, whole: Tensor | None) -> Tensor:
+        h = self.input(x.flatten(1)) + self.time(sinusoid(levels.mean(1), 64))
+        h = h if whole is None else h + whole
+        for block in self.blocks:
+            h = h + block["2"](functional.mish(block["0"](block["norm"](h))))
+        return self.out(functional.mish(h)).unflatten(1, (x.shape[1], -1))
+
+
+class Actor(nn.Module):
+    """That network over actions, latents and level embedding, with the linear skip and the embedding of the real steps."""
+
+    def __init__(self, latent: int, horizon: int, steps: int, width: int) -> None:
+        super().__init__()
+        d_in = ACTION + latent + Denoiser.LEVEL
+        self.backbone, self.input_skip = ResidualMlp(d_in, ACTION, horizon, width, 2), nn.Linear(d_in, ACTION)
+        self.observed = nn.Sequential(nn.Linear(steps * (STATE + ACTION + 1), 128), nn.SiLU(), nn.Linear(128, width))
+
+    def forward(self, given: Tensors) -> Tensors:
+        parts = [given["x"], given.get("latents"), sinusoid(given["levels"], Denoiser.LEVEL)]
+        x = torch.cat([part for part in parts if part is not None], -1)
+        return {"x0": self.backbone(x, given["levels"], self.observed(given["observed"][:, 0])) + self.input_skip(x)}
+
+
+class Critic(nn.Module):
+    """Critics of implicit Q-learning with its loss, equations 5 and 6 of Kostrikov et al. 2022; they are their own slow copy."""
+
+    DISCOUNT, EXPECTILE, END_WORTH = 0.9, 0.7, -0.4
+
+    def __init__(self, latent: int, width: int) -> None:
+        super().__init__()
+        self.q1, self.q2 = mlp(STATE + ACTION + latent, width, 1), mlp(STATE + ACTION + latent, width, 1)
+        self.v = mlp(STATE + latent, width, 1)
+
+    def forward(self, given: Tensors) -> Tensors:
+        now = torch.cat([given["state"], given["action"], given["latents"]], -1)
+        q1, q2, v = self.q1(now), self.q2(now), self.v(torch.cat([given["state"], given["latents"]], -1))
+        later = self.v(torch.cat([given["next_state"], given["next_latents"]], -1)).detach()
+        later = torch.where(given["ended"] > 0.5, self.END_WORTH, later)
+        aim = given["gain"] + self.DISCOUNT * later
+        u = torch.minimum(q1, q2).detach() - v
+        assert (u < 0).any() and (u > 0).any() and (q1 < q2).any() and (q1 > q2).any()
+        of_v = (torch.where(u < 0, 1 - self.EXPECTILE, self.EXPECTILE) * u**2).mean()
+        of_q = functional.mse_loss(q1, aim) + functional.mse_loss(q2, aim)
+        return {"q1": q1, "q2": q2, "v": v, "loss": of_q + of_v, "loss_q": of_q, "loss_v": of_v}
 
 
 class Inverse(nn.Sequential):
@@ -354,6 +508,14 @@ def window(batch: int, steps: int, latent: int, obs_horizon: int) -> Tensors:
     return given
 
 
+def actor(batch: int, steps: int, latent: int, observed: int) -> Tensors:
+    """What a denoiser of actions is given."""
+    given = {"x": torch.randn(batch, steps, ACTION), "observed": torch.randn(batch, 1, observed * (STATE + ACTION + 1))}
+    if latent:
+        given["latents"] = torch.randn(batch, steps, latent)
+    return given | {"levels": torch.randint(0, LEVEL_MAX + 1, (batch, steps)).double()}
+
+
 def block(batch: int, steps: int) -> Tensors:
     """Tokens of which this and that is absent; what stands in an absent part must not matter."""
     return {
@@ -425,6 +587,28 @@ def last_cases() -> dict[str, tuple[nn.Module, Tensors]]:
             NoisyInverse(7),
             {"state": torch.randn(3, 5, 2 * STATE), "noise": torch.randn(3, 5, ACTION), "levels": torch.randint(1, 11, (3, 5))},
         ),
+    }
+
+
+def policy_cases() -> dict[str, tuple[nn.Module, Tensors]]:
+    """And once those are."""
+
+    def given(batch: int, steps: int, latent: int, observed: int) -> Tensors:
+        given = window(batch, steps, latent, 1)
+        if observed:
+            given |= {"x": torch.randn(batch, steps, ACTION), "observed": torch.randn(batch, 1, observed * (STATE + ACTION + 1))}
+        return given
+
+    transitions = {name: torch.randn(40, 1, width) for name, width in (("state", STATE), ("action", ACTION), ("latents", 4))}
+    transitions |= {"next_state": torch.randn(40, 1, STATE), "next_latents": torch.randn(40, 1, 4), "gain": torch.randn(40, 1, 1)}
+    transitions |= {"ended": torch.randint(0, 2, (40, 1, 1)).double()}
+    return {
+        "policy": (Policy(4, 2, (7, 3), (12, 3, 2, 2)), given(3, 7, 4, 3) | {"told": torch.randn(3, 1, 3)}),
+        "policy_each": (Policy(0, 0, (5, 1), (10, 1, 0, 1)), given(2, 5, 0, 1)),
+        "policy_alone": (Policy(3, 0, (3, 0), (6, 3, 0, 2)), given(5, 3, 3, 0)),
+        "actor": (Actor(4, 1, 2, 12), actor(5, 1, 4, 2)),
+        "actor_plain": (Actor(0, 3, 1, 7), actor(2, 3, 0, 1)),
+        "critic": (Critic(4, 9), transitions),
     }
 
 
@@ -512,7 +696,8 @@ def main() -> None:
     torch.set_default_dtype(torch.float64)
     done = results(cases())
     done |= results(later_cases())
-    save(Path(__file__).with_name("networks.safetensors"), last_cases(), process() | done)
+    done |= results(last_cases())
+    save(Path(__file__).with_name("networks.safetensors"), policy_cases(), process() | done)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ use ada_diffuser::model::{
     config::{ModelConfig, Restart},
     critic::{Given, Sizes, Value},
     method::{
-        Actions, Backbone, Baseline, Diffused, GruLatent, Guide, Head, History, Inverse, LatentSource, Looks, Target, Told, TrueFuture,
+        Actions, Backbone, Baseline, Diffused, GruLatent, Guide, Head, History, Inverse, LatentSource, Looks, Schedule, Target, Told,
+        TrueFuture,
     },
     nn::{Activations, Buffer, Params, Traced, gradient},
     normalizer::Affine,
@@ -120,7 +121,7 @@ fn a_tick_allocates_nothing() {
     }
 }
 
-/// Guided, in the future too, with candidates, told, several rows at once; of states alone; of an oracle.
+/// Guided, in the future too, with candidates, told, several rows at once; of states or actions alone; of an oracle; chosen by critics.
 #[test]
 fn ticks_of_other_methods_allocate_nothing() {
     let (unet, latent) = (Backbone::Unet { widths: vec![8, 16] }, GruLatent::plain(5, 16, Looks::Block(4)));
@@ -141,19 +142,34 @@ fn ticks_of_other_methods_allocate_nothing() {
         config.method.latent = LatentSource::Truth { dim: 2, future: TrueFuture::Known };
         config.units.context = Some(Affine::identity(2));
     });
-    for (agent, judged, told, context) in [
-        (guided(Guide::Value { widths: vec![8, 16] }), true, false, None),
-        (guided(Guide::DecoderReturn), true, false, None),
-        (of_states, false, true, None),
-        (oracle, false, false, Some(vec![vec![0.3, 0.4]])),
+    let transformer = Backbone::EncoderDecoder { width: 16, depth: 2, heads: 2, encoder_depth: 1, dropout: 0.1 };
+    let policy = agent_with(latent.clone(), transformer, 2, |config| config.method.plan.diffused = Diffused::Action);
+    let actor = Backbone::Mlp { width: 16, depth: 2, dropout: 0.1 };
+    let chosen = agent_with(latent.clone(), actor, 1, |config| {
+        (config.method.plan.diffused, config.method.plan.horizon) = (Diffused::Action, 1);
+        config.method.plan.schedule = Schedule::Uniform { steps: 5 };
+        (config.method.guide, config.units.returns) = (Some(Guide::Critic { width: 8 }), Some(Affine::identity(1)));
+        (config.trained.action_horizons, config.trained.refined) = (vec![1], false);
+        (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
+    });
+    for (agent, told, context) in [
+        (guided(Guide::Value { widths: vec![8, 16] }), false, None),
+        (guided(Guide::DecoderReturn), false, None),
+        (of_states, true, None),
+        (policy, false, None),
+        (chosen, false, None),
+        (oracle, false, Some(vec![vec![0.3, 0.4]])),
     ] {
+        let (config, guide) = (agent.config(), agent.config().method.guide.as_ref());
+        let (leads, chooses) = (guide.is_some_and(Guide::leads), guide.is_some());
         let options = |i: usize| SamplerOptions {
             eta: 1.0,
-            action_horizon: 1 + i % 3,
+            action_horizon: 1 + i % config.trained.action_horizons.len().min(3),
+            kappa: config.defaults.sampler.kappa,
             streaming: false,
-            guidance_scale: if judged { i as f32 } else { 0.0 },
-            guidance_samples: if judged && i > 0 { i % 3 } else { 0 },
-            candidates: if judged { 1 + i % 4 } else { 1 },
+            guidance_scale: if leads { i as f32 } else { 0.0 },
+            guidance_samples: if leads && i > 0 { i % 3 } else { 0 },
+            candidates: if chooses { 1 + i % 4 } else { 1 },
             pick_temperature: (i % 2) as f32,
             told_return: (told && !i.is_multiple_of(3)).then_some(0.5),
             free_guidance_scale: if told && !i.is_multiple_of(3) { i as f32 } else { 1.0 },
@@ -185,10 +201,10 @@ fn a_gradient_allocates_nothing() {
     let sizes = Sizes { columns: 5, latent_dim: 5, horizon: 8, widths: &[8, 16] };
     let value = frozen(|params| Value::new(sizes, 40, &params.with_way_back()).unwrap());
     let denoise = |networks: &Networks, x: Traced, latents: &Traced, levels: &[f32]| {
-        networks.denoiser.predict(&x, &Given { levels, latents: Some(latents), observed: None, told: None })
+        networks.denoiser.predict(&x, &Given { latents: Some(latents), ..Given::levels(levels) })
     };
     let runs: [Run; 3] = [
-        &|[x, latents], levels| value.predict(&x, &Given { levels, latents: Some(&latents), observed: None, told: None }),
+        &|[x, latents], levels| value.predict(&x, &Given { latents: Some(&latents), ..Given::levels(levels) }),
         &|[x, latents], levels| denoise(&unet, x, &latents, levels),
         &|[x, latents], levels| denoise(&dit, x, &latents, levels),
     ];

@@ -54,6 +54,8 @@ class Core:
 
     faults: list[Refusal | str] = field(default_factory=list)
     sessions: dict[str, Session] = field(default_factory=dict)
+    #: Sessions so far.
+    opened: int = 0
     #: Every act that arrived: (session, step, observation).
     seen: list[tuple[str, int, object]] = field(default_factory=list)
     #: Every reset that arrived: (session, seed, whether the history is kept), and whether it may be.
@@ -70,7 +72,7 @@ class Core:
 
     def open(self) -> str:
         with self.lock:
-            name = f"s{len(self.sessions)}"
+            name, self.opened = f"s{self.opened}", self.opened + 1
             self.sessions[name] = Session()
             return name
 
@@ -142,6 +144,9 @@ class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
 
     def List(self, request, context):  # noqa: N802
         return models_pb2.ListModelsResponse(models=[_model(self.core)])
+
+    def Get(self, request, context):  # noqa: N802
+        return models_pb2.GetModelResponse(model=_model(self.core))
 
     def OpenSession(self, request, context):  # noqa: N802
         self.core.options.append(request.options)

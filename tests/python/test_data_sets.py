@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -14,48 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-
-ROOT = Path(__file__).resolve().parents[2]
-TRAINER = Path(os.environ.get("ADA_TRAINER", ROOT / "target/release/ada-trainer"))
-RECIPE = ROOT / "tests/golden/small.toml"
-EPISODES, STEPS = 12, 24
-ROWS = EPISODES * STEPS
-
-Arrays = dict[str, np.ndarray]
-
-
-def arrays() -> Arrays:
-    """Small whole numbers, so that every type holds them exactly."""
-    rng = np.random.default_rng(0)
-    ends = np.arange(1, ROWS + 1) % STEPS == 0
-    return {
-        "observations": rng.integers(0, 100, (ROWS, 3)).astype(np.float32),
-        "actions": rng.integers(0, 2, (ROWS, 2)).astype(np.float32),
-        "rewards": rng.integers(0, 50, ROWS).astype(np.float32),
-        "terminals": ends & (np.arange(ROWS) >= ROWS // 2),
-        "timeouts": ends & (np.arange(ROWS) < ROWS // 2),
-        "infos/context": np.repeat(rng.integers(0, 9, (EPISODES, 1)), STEPS, axis=0).astype(np.float32),
-    }
-
-
-def write(path: Path, columns: Arrays, libver: str = "earliest", **how: Any) -> Path:
-    with h5py.File(path, "w", libver=libver) as file:
-        for name, values in columns.items():
-            file.create_dataset(name, data=values, **how)
-    return path
-
-
-def train(data: Path, out: Path, *flags: str) -> subprocess.CompletedProcess[str]:
-    command = [TRAINER, "run", RECIPE, "--data", data, "--out", out, *flags]
-    return subprocess.run([str(word) for word in command], capture_output=True, text=True, cwd=ROOT, timeout=300, check=False)
-
-
-def log(data: Path, out: Path) -> str:
-    """The log of a run that has read everything and drawn from all episodes."""
-    few = ["--set", "stages.identify.steps=2", "--set", "stages.denoise.steps=2", "--set", "log_every=1"]
-    done = train(data, out, *few)
-    assert done.returncode == 0, done.stderr
-    return (out / "training/log.jsonl").read_text()
+from trainer import EPISODES, RECIPE, ROOT, ROWS, STEPS, TRAINER, Arrays, arrays, episodes_of, log, train, write
 
 
 def refusal(data: Path, out: Path) -> str:
@@ -505,42 +463,6 @@ def example(title: str, folder: Path) -> subprocess.CompletedProcess[str]:
     text = (ROOT / "docs/data.md").read_text(encoding="utf-8")
     code = text.split(f"\n{title} ", 1)[1].split("```python\n", 1)[1].split("```", 1)[0]
     return subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=True)
-
-
-def episodes_of(columns: Arrays) -> list[Arrays]:
-    return [{name: values[at : at + STEPS] for name, values in columns.items()} for at in range(0, ROWS, STEPS)]
-
-
-@pytest.fixture(scope="module")
-def blind(tmp_path_factory) -> str:
-    """The log of the plain file without context, which other layouts do not have."""
-    folder = tmp_path_factory.mktemp("blind")
-    columns = arrays()
-    del columns["infos/context"]
-    return log(write(folder / "blind.h5", columns), folder / "out")
-
-
-def test_the_way_out_of_minari(blind, tmp_path):
-    with h5py.File(tmp_path / "main_data.hdf5", "w") as file:
-        for index, steps in enumerate(episodes_of(arrays())):
-            episode = file.create_group(f"episode_{index}")
-            episode["observations"] = np.vstack([steps["observations"], np.full((1, 3), 99)])
-            episode["actions"], episode["rewards"] = steps["actions"], steps["rewards"]
-            episode["terminations"], episode["truncations"] = steps["terminals"], steps["timeouts"]
-    example("Minari", tmp_path)
-    assert log(tmp_path / "data.h5", tmp_path / "out") == blind
-
-
-def test_the_way_out_of_robomimic(blind, tmp_path):
-    with h5py.File(tmp_path / "demo.hdf5", "w") as file:
-        for index, steps in enumerate(episodes_of(arrays())):
-            demo = file.create_group(f"data/demo_{index}")
-            for column, key in enumerate(["robot0_eef_pos", "robot0_eef_quat", "object"]):
-                demo[f"obs/{key}"] = steps["observations"][:, column : column + 1]
-            demo["actions"], demo["rewards"] = steps["actions"], steps["rewards"]
-            demo["dones"] = steps["terminals"].astype(np.int64)
-    example("robomimic", tmp_path)
-    assert log(tmp_path / "data.h5", tmp_path / "out") == blind
 
 
 def test_the_way_out_of_lerobot(tmp_path):

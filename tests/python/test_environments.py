@@ -21,7 +21,8 @@ from ada_diffuser.dataset import load_episodes
 from ada_diffuser.environments.half_cheetah import XML, HalfCheetahBody
 
 CHEETAHS = [name for name in environments.NAMES if name.startswith("cheetah-wind") or name == "cheetah-vel-e"]
-FALLS = ("hopper-gravity-e", "walker-mass-e")
+HIDDEN = environments.hidden()
+FALLS = ("hopper-gravity-e", "walker-mass-e", "walker2d")
 """Environments whose episodes a fall ends."""
 EARNED = dict.fromkeys(FALLS, 900.0) | {"cheetah-dir-e": 200.0, "ant-dir-e": 100.0}
 """What an expert may earn, where that is not below 0."""
@@ -37,7 +38,7 @@ def test_passes_gymnasiums_own_checker(name):
         check_env(environments.make(name).unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("name", sorted(set(environments.NAMES) - set(FALLS)))
+@pytest.mark.parametrize("name", sorted(set(HIDDEN) - set(FALLS)))
 def test_truncates_after_200_steps_and_never_terminates(name):
     env = environments.make(name)
     env.reset(seed=0)
@@ -45,7 +46,15 @@ def test_truncates_after_200_steps_and_never_terminates(name):
     assert ends[:-1] == [(False, False)] * 199 and ends[-1] == (False, True)
 
 
-@pytest.mark.parametrize("name", environments.NAMES)
+@pytest.mark.parametrize("name", sorted(set(environments.NAMES) - set(HIDDEN)))
+def test_what_hides_nothing_tells_no_context(name):
+    env = environments.make(name)
+    observation, info = env.reset(seed=3)
+    assert observation.dtype == np.float32 and env.observation_space.contains(observation)
+    assert "context" not in info and not hasattr(env.unwrapped, "context") and not hasattr(env.unwrapped, "coming_context")
+
+
+@pytest.mark.parametrize("name", HIDDEN)
 def test_observations_are_float32_and_do_not_hold_the_context(name):
     env = environments.make(name)
     observation, info = env.reset(seed=3)
@@ -62,14 +71,14 @@ def test_same_seed_same_episode(name):
         rng = np.random.default_rng(1)
         for _ in range(20):
             observation, reward, _, _, info = env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
-            rows.append(np.concatenate([observation, [reward], info["context"]]))
+            rows.append(np.concatenate([observation, [reward], info.get("context", [])]))
         return np.concatenate(rows)
 
     assert np.array_equal(episode(5), episode(5))
     assert not np.array_equal(episode(5), episode(6))
 
 
-@pytest.mark.parametrize("name", environments.NAMES)
+@pytest.mark.parametrize("name", HIDDEN)
 def test_a_steps_info_holds_the_context_that_acted_in_it(name):
     env = environments.make(name).unwrapped
     _, info = env.reset(seed=2)
@@ -387,7 +396,7 @@ def test_vel_e_draws_the_phase_of_lilac_in_each_session_where_it_is_wanted():
     assert np.allclose(session(0, phase=2.0), wave, atol=1e-6) and np.allclose(session(1, phase=2.0), wave, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", environments.NAMES)
+@pytest.mark.parametrize("name", HIDDEN)
 def test_a_return_of_standing_still_counts_as_failed_and_an_experts_does_not(name):
     env = environments.make(name).unwrapped
     env.reset(seed=0)

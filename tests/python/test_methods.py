@@ -20,8 +20,13 @@ from ada_diffuser.rollout import Trial, evaluate
 TRAINER = Path(os.environ.get("ADA_TRAINER", ROOT / "target/release/ada-trainer"))
 RECIPE = ROOT / "models/point-wind-s/recipe.toml"
 METHODS = sorted((ROOT / "models/methods").glob("*.toml"))
+#: By the kind that a method asks for, if it does.
+TINY_NETWORKS = {
+    "encoder_decoder": 'model.plan.backbone={kind="encoder_decoder",width=16,depth=1,heads=2,encoder_depth=1,dropout=0.1}',
+    "mlp": 'model.plan.backbone={kind="mlp",width=16,depth=1,dropout=0.1}',
+    "": 'model.plan.backbone={kind="dit",width=16,depth=1,heads=2}',
+}
 TINY = [
-    'model.plan.backbone={kind="dit",width=16,depth=1,heads=2}',
     "losses.denoise.batch=4",
     "stages.denoise.steps=4",
     "stages.denoise.learning_rate.warm_up=1",
@@ -38,8 +43,10 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert collect(["--env", "point-wind-s", "--episodes", "12", "--quiet", "--out", str(data)]) == 0
     for method in [None, *METHODS]:
         name = method.stem if method else "plain"
-        latent = method is None or 'stages.identify"' not in method.read_text(encoding="utf-8")
-        words = [word for text in TINY + (TINY_LATENT if latent else []) for word in ("--set", text)]
+        text = method.read_text(encoding="utf-8") if method else ""
+        network = next(network for kind, network in TINY_NETWORKS.items() if f'backbone" = {{ kind = "{kind}' in text or not kind)
+        keys = [network, *TINY, *([] if 'stages.identify"' in text else TINY_LATENT)]
+        words = [word for key in keys for word in ("--set", key)]
         chosen = ["--with", str(method)] if method else []
         command = [str(TRAINER), "run", str(RECIPE), "--data", str(data), "--out", str(folder / "models" / name), *chosen, *words]
         subprocess.run(command, check=True, capture_output=True, cwd=folder, timeout=120)
@@ -88,6 +95,8 @@ def test_what_a_method_takes_is_told(address: str) -> None:
             assert chunk.value is not None and chunk.value_spread > 0.0 and chunk.evaluations == 8 * chunk.passes
         told = {scale: act("told-return", SamplerOptions(**cold, told_return=-0.1, free_guidance_scale=scale)) for scale in (0.0, 1.0, 3.0)}
         assert not np.array_equal(told[0.0], told[1.0]) and not np.array_equal(told[1.0], told[3.0])
+        goals = [act("told-goal", SamplerOptions(**cold, told_goal=goal)) for goal in ((-1.0, 0.0), (1.0, 0.0))]
+        assert not np.array_equal(*goals)
         truth = [act("oracle", SamplerOptions(**cold), context=[[wind, 0.0]]) for wind in (-4.0, 4.0)]
         assert not np.array_equal(*truth)
         for method, options, field in [
@@ -95,6 +104,8 @@ def test_what_a_method_takes_is_told(address: str) -> None:
             ("plain", {"candidates": 2, "streaming": False}, "options.candidates"),
             ("plain", {"told_return": 1.0}, "options.told_return"),
             ("told-return", {"told_goal": [1.0]}, "options.told_goal"),
+            ("told-goal", {"told_goal": [1.0]}, "options.told_goal"),
+            ("told-goal", {"free_guidance_scale": 1.2}, "options.free_guidance_scale"),
             ("guided", {"candidates": 2, "streaming": True}, "options.candidates"),
         ]:
             with pytest.raises(InvalidInput) as refused:

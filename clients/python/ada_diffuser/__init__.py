@@ -1,6 +1,7 @@
 """Python side of Ada-Diffuser: client, environments, data collection, evaluation.
 
-`Client` and what it speaks of stand here; the rest is in the modules of those names and needs `ada-diffuser[mujoco]`.
+`Client` and what it speaks of stand here; the rest is in the modules of those names and needs `ada-diffuser[mujoco]`, or for
+`ada_diffuser.importing` `ada-diffuser[import]`.
 """
 
 from ada_diffuser.broker import ChunkBroker

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -11,8 +11,8 @@ import gymnasium as gym
 import numpy as np
 
 from . import environments
-from .dataset import Episodes
-from .experts import Expert
+from .dataset import Episodes, returns_summary
+from .experts import Expert, Flight
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,17 @@ class Job:
 
 
 def collect(
-    job: Job, expert: Expert, progress: Callable[[int], object] = lambda episodes: None, *, blind: Expert | None = None
+    job: Job,
+    expert: Expert,
+    progress: Callable[[int], object] = lambda episodes: None,
+    *,
+    blind: Expert | None = None,
+    flights: Sequence[Flight] | None = None,
 ) -> tuple[Episodes, np.ndarray]:
     """Fly the episodes; returns them and which of them failed, (episodes,) bool. A pure function of its arguments.
 
-    `progress` is called with the number of episodes just flown. `blind` flies the share that the job wants flown blind.
+    `progress` is called with the number of episodes just flown. `blind` flies the share that the job wants flown blind. `flights` say of
+    each episode who flies it, where that is not the expert.
     """
     flown_blind, played = job.flown_blind(), job.played()
     if blind is None and flown_blind.any():
@@ -78,9 +84,11 @@ def collect(
     other = _OtherWorld(job) if played.any() else None
     flown, failed = [], np.zeros(job.episodes, np.bool_)
     for episode, (is_blind, is_play) in enumerate(zip(flown_blind, played, strict=True)):
-        std = float(rng.choice(job.noise))
-        pilot, told = blind if is_blind else expert, other if is_play else None
-        flown.append(_fly(env, pilot, std, rng, seeds[episode], told))
+        flight = Flight(expert) if flights is None else flights[episode]
+        std = float(rng.choice(job.noise)) if flight.noise is None else flight.noise
+        seed = seeds[episode] if flight.seed is None else flight.seed
+        pilot, told = blind if is_blind else flight.expert, other if is_play else None
+        flown.append(_fly(env, pilot, std, rng, seed, told))
         failed[episode] = environments.failed(env, float(flown[-1].rewards.sum()))
         if job.blind:
             flown[-1].blind = np.full(len(flown[-1].rewards), is_blind)
@@ -113,11 +121,9 @@ def _check_fit(env: gym.Env, expert: Expert) -> None:
     made_for = expert.sizes(0 if context is None else len(context))
     if made_for is None:
         return
-    if context is None:
-        raise ValueError(f"{env.spec.id} has no hidden context that an expert could see")
     wanted = env.observation_space.shape[0], env.action_space.shape[0]
     if made_for != wanted:
-        raise ValueError(f"the expert is made for observations and actions of {made_for} numbers, the environment has {wanted}")
+        raise ValueError(f"the expert is made for observations and actions of {made_for} numbers, {env.spec.id} has {wanted}")
 
 
 def _context(env: gym.Env) -> np.ndarray | None:
@@ -155,34 +161,46 @@ class _OtherWorld:
 def _fly(
     env: gym.Env, expert: Expert, std: float, rng: np.random.Generator, seed: int | None, other: _OtherWorld | None = None
 ) -> Episodes:
-    """One episode with action noise `std`; the expert is told the context of the `other` world, if there is one."""
+    """One episode with action noise `std`; the expert is told the context of the `other` world, if there is one, and the goal where an
+    environment has one and no context.
+    """
     observation, _ = env.reset(seed=seed)
     if other:
         other.begin(session=seed is not None)
         if other.context is None:
             raise ValueError(f"--play: {env.spec.id} has no hidden context that an expert could be told falsely")
     _check_fit(env, expert)  # not before: what a class draws in `reset` need not be there earlier
+    expert.begin(rng)
     low, high = env.action_space.low, env.action_space.high
     steps: list[tuple[Any, ...]] = []
     ended = False
     while not ended:
-        wanted = expert.act(observation, other.context if other else _context(env))
+        goal = environments.goal(env)
+        context = other.context if other else _context(env)
+        wanted = expert.act(observation, goal if context is None else context)
         if wanted.shape != low.shape:
             raise ValueError(f"the expert answered an array of shape {wanted.shape}, an action of {env.spec.id} has {low.shape}")
         action = np.clip(wanted + std * rng.standard_normal(wanted.shape), low, high).astype(np.float32)
         following, reward, terminal, timeout, info = env.step(action)
         if other:
             other.follow(action)
-        steps.append((observation, action, reward, terminal, timeout, std, info.get("context")))
+        steps.append((observation, action, reward, terminal, timeout, std, goal, info.get("context")))
         observation, ended = following, terminal or timeout
-    *columns, contexts = zip(*steps, strict=True)
+    *columns, goals, contexts = zip(*steps, strict=True)
     dtypes = (np.float32, np.float32, np.float32, np.bool_, np.bool_, np.float32)
     arrays = [np.array(column, dtype) for column, dtype in zip(columns, dtypes, strict=True)]
-    told = None if contexts[0] is None else np.array(contexts, np.float32).reshape(len(contexts), -1)
-    return Episodes(*arrays, context=told)
+    told, wanted = (None if rows[0] is None else np.array(rows, np.float32).reshape(len(rows), -1) for rows in (contexts, goals))
+    return Episodes(*arrays, context=told, goal=wanted)
 
 
-def data_card(job: Job, expert: Expert, episodes: Episodes, failed: np.ndarray, blind: Expert | None = None) -> dict[str, Any]:
+def data_card(
+    job: Job,
+    expert: Expert,
+    episodes: Episodes,
+    failed: np.ndarray,
+    blind: Expert | None = None,
+    quality: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """What the episodes are and how they came about, without the facts about their file."""
     returns = episodes.returns()
     card = {
@@ -194,7 +212,9 @@ def data_card(job: Job, expert: Expert, episodes: Episodes, failed: np.ndarray, 
         "seed": job.seed,
         "action_noise": list(job.noise),
         "returns": returns_summary(returns, failed),
+        **_measures(job, returns),
         "expert": expert.card,
+        **({"quality": quality} if quality else {}),
     }
     flown_blind, played = job.flown_blind(), job.played()
 
@@ -209,13 +229,9 @@ def data_card(job: Job, expert: Expert, episodes: Episodes, failed: np.ndarray, 
     return card | {"versions": {name: version(name) for name in ("ada-diffuser", "gymnasium", "h5py", "mujoco", "numpy")}}
 
 
-def returns_summary(returns: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
-    """What a card says of the returns (episodes,) of at least one episode, and of which failed."""
-    return {
-        "mean": round(float(returns.mean()), 3),
-        "standard_error": round(float(returns.std(ddof=1) / np.sqrt(len(returns))), 3) if len(returns) > 1 else None,
-        "median": round(float(np.median(returns)), 3),
-        "min": round(float(returns.min()), 3),
-        "max": round(float(returns.max()), 3),
-        "failures": int(failed.sum()),
-    }
+def _measures(job: Job, returns: np.ndarray) -> dict[str, Any]:
+    """The means of what the environment says of its episodes beside their returns; nothing where it says nothing."""
+    env = environments.make(job.env, episode_steps=job.episode_steps, **job.options)
+    said = [environments.measures(env, float(value)) for value in returns]
+    env.close()
+    return {"measures": {name: round(float(np.mean([one[name] for one in said])), 3) for name in said[0]}} if said[0] else {}

@@ -10,6 +10,7 @@ use super::{
     types::Known,
 };
 use crate::model::{
+    columns::Columns,
     config::ModelConfig,
     diffusion::{
         descent::{Descent, Sampling, Walk},
@@ -53,7 +54,7 @@ impl Act {
     /// An act on `episode`, which has taken note of what was executed.
     pub(super) fn new(episode: Episode, known: Known, table: Table, config: &ModelConfig) -> Self {
         let (options, method) = (episode.options(), &config.method);
-        let width = method.plan.width(config.layout.widths());
+        let columns = Columns::new(method.plan.diffused, config.layout);
         let latents = Chain::new(method.plan.horizon + options.action_horizon - 1, method.latent.dim());
         let sampling = |index| Sampling {
             table,
@@ -66,7 +67,7 @@ impl Act {
         };
         let candidate = |index| {
             Candidate::new(
-                Descent::new(sampling(index), known.state.clone(), [method.plan.horizon, width]),
+                Descent::new(sampling(index), known.state.clone(), method.plan.horizon, &columns),
                 latents.clone(),
                 [options.action_horizon, config.layout.action_dim],
             )
@@ -294,6 +295,11 @@ impl Act {
         }
     }
 
+    /// The real past of now, the last token first.
+    pub(super) fn real_past(&self, back: usize) -> Option<TokenRef<'_>> {
+        self.episode.past(back)
+    }
+
     /// Token `position` of a window from the current one on: the real state, or what the window has there. Of a future that has not come an act
     /// has nothing.
     pub(super) fn ahead<'a>(&self, window: &'a Candidate, position: usize, evidence: Evidence, walk: Walk) -> TokenRef<'a> {
@@ -336,7 +342,8 @@ impl Act {
         let chosen = candidates.swap_remove(choice.index);
         let (normalizer, descent) = (&config.units.normalizer, chosen.descent());
         let actions: Vec<Vec<f32>> = (0..chosen.actions_len()).map(|index| chosen.action(index).to_vec()).collect();
-        let states = descent.planned().chunks(walk.columns.width()).map(|position| &position[walk.columns.state.clone()]);
+        let positions = descent.planned().chunks(walk.columns.width()).filter(|_| !walk.columns.state.is_empty());
+        let states = positions.map(|position| &position[walk.columns.state.clone()]);
         // An act that never asked the network has no latent of its own.
         let latent = match episode.latent().filter(|_| descent.evaluations() == 0) {
             Some((mean, log_var)) => (mean.to_vec(), log_var.to_vec()),

@@ -126,7 +126,7 @@ impl Agent {
     fn denoise(&self, acts: &mut [Act]) -> Result<()> {
         let inputs = self.inputs(acts)?;
         let Inputs { x, levels, latents, observed, told } = &inputs;
-        let given = Given { levels, latents: latents.as_ref(), observed: observed.as_ref(), told: told.as_ref() };
+        let given = Given { latents: latents.as_ref(), observed: observed.as_ref(), told: told.as_ref(), ..Given::levels(levels) };
         let mut estimates = self.networks().denoiser.predict(x, &given)?;
         self.estimate(acts, x, &mut estimates);
         self.guide(acts, &mut estimates)?;
@@ -196,9 +196,7 @@ impl Agent {
             x: by_row(self.walk().columns.width(), &|row, out| out.copy_from_slice(row.window().descent().x(row.slot())))?,
             levels: by_row(1, &|row, out| row.window().descent().write_levels(row.slot(), out))?,
             latents: (latent_dim > 0).then(|| by_row(latent_dim, &|row, out| row.act().write_latents(row.window(), out))).transpose()?,
-            observed: (plan.obs_horizon > 1)
-                .then(|| rows::observed(evaluated(acts), plan.obs_horizon - 1, self.config(), self.walk()))
-                .transpose()?,
+            observed: rows::observed(evaluated(acts), self.config(), self.walk())?,
             told: (told > 0).then(|| rows::gather(evaluated(acts), [1, told + 1], tell)).transpose()?,
         })
     }

@@ -173,17 +173,27 @@ impl Candidate {
         self.actions = actions.to_vec();
     }
 
-    /// An imagined step: state and action.
+    /// An imagined step: state and action. Where actions alone are diffused, of the first one the real state, and of later ones none.
     pub(super) fn imagined(&self, index: usize, walk: Walk) -> TokenRef<'_> {
-        let state = &self.descent.given(index)[walk.columns.state.clone()];
-        TokenRef { state: Some(state), action: (index < self.actions_len()).then(|| self.action(index)), ..TokenRef::default() }
+        let state = self.state_of(&self.descent.given(index)[walk.columns.state.clone()], index);
+        TokenRef { state, action: (index < self.actions_len()).then(|| self.action(index)), ..TokenRef::default() }
+    }
+
+    /// The state so many steps after the real one, which stands here in the window, if states are diffused.
+    fn state_of<'a>(&'a self, here: &'a [f32], steps: usize) -> Option<&'a [f32]> {
+        match (here.is_empty(), steps) {
+            (false, _) => Some(here),
+            (true, 0) => Some(self.descent.known()),
+            (true, _) => None,
+        }
     }
 
     /// A position of the window as a token.
     pub(super) fn token(&self, position: usize, walk: Walk) -> TokenRef<'_> {
         let (columns, x) = (walk.columns, self.descent.position(position));
         let action = (!columns.action.is_empty()).then(|| &x[columns.action.clone()]);
-        TokenRef { state: Some(&x[columns.state.clone()]), action, noise: self.descent.sigma(position, walk), ..TokenRef::default() }
+        let state = self.state_of(&x[columns.state.clone()], self.descent.given_len() + position);
+        TokenRef { state, action, noise: self.descent.sigma(position, walk), ..TokenRef::default() }
     }
 
     /// The plan as it was when its first action was given out, `T * D` values: what was given out, and the last estimate of what comes then.

@@ -5,6 +5,7 @@ use super::{
     rows::{self, Row, evaluated},
 };
 use crate::model::{
+    critic::Critic,
     diffusion::guidance::{Futures, Seat, lead},
     nn::{Activations, Buffer},
     noise::Slot,
@@ -70,7 +71,7 @@ impl Agent {
             latents: (latent_dim > 0).then(|| gather(latent_dim, &write_latents)).transpose()?,
         };
         let Some(future) = future else { return self.judge().gradient(&seat) };
-        let (plan, told) = (&self.config().method.plan, self.config().method.told_width());
+        let told = self.config().method.told_width();
         let noise = gather(width, &|led, out| {
             let (descent, time) = (&led.row.window().descent(), led.row.window().descent().time());
             for (position, out) in out.chunks_exact_mut(width).enumerate() {
@@ -82,38 +83,62 @@ impl Agent {
             let columns = self.walk().columns.known(0, led.row.window().descent().given_len() == 0);
             out[columns].fill(1.0);
         })?;
-        let observed = || rows::observed(rows.clone().map(|led| led.row), plan.obs_horizon - 1, self.config(), self.walk());
         let tell = || rows::gather(rows.clone(), [1, told + 1], |led, out| led.row.act().write_told(true, out));
         let futures = Futures {
             noise,
             known,
-            observed: (plan.obs_horizon > 1).then(observed).transpose()?,
+            observed: rows::observed(rows.clone().map(|led| led.row), self.config(), self.walk())?,
             told: (told > 0).then(tell).transpose()?,
         };
         self.judge().gradient_in_future(&seat, &futures)
     }
 
-    /// What each candidate's plan is worth; each act then chooses.
+    /// What each candidate is worth; each act then chooses.
     pub(super) fn choose(&self, acts: &mut [Act]) -> Result<()> {
-        let choosing = |act: &Act| act.asks(Ask::Choose);
-        let plans = || {
-            let acts = acts.iter().filter(|act| choosing(act));
-            acts.flat_map(|act| act.candidates().iter().map(move |window| Row::of(act, window)))
+        let values = match &self.networks().critic {
+            Some(critic) => self.worth_of_actions(critic, candidates(acts))?,
+            None => self.worth_of_plans(candidates(acts))?,
         };
-        let (horizon, width) = (self.config().method.plan.horizon, self.walk().columns.width());
-        let latent_dim = self.config().method.latent.dim();
-        let latent = |row: Row, out: &mut [f32]| row.window().latents().write_means(out);
-        let x = rows::gather(plans(), [horizon, width], |row, out| row.window().write_plan(out))?;
-        let latents = (latent_dim > 0).then(|| rows::gather(plans(), [horizon, latent_dim], latent)).transpose()?;
-        let values = self.judge().worth(&x, latents.as_ref())?;
         let mut rest = &values[..];
-        for act in acts.iter_mut().filter(|act| choosing(act)) {
+        for act in acts.iter_mut().filter(|act| act.asks(Ask::Choose)) {
             let (of_act, after) = rest.split_at(act.candidates().len());
             act.choose(of_act);
             rest = after;
         }
         Ok(())
     }
+}
+
+impl Agent {
+    /// By the guide, of whole plans.
+    fn worth_of_plans<'a>(&self, plans: impl Iterator<Item = Row<'a>> + Clone + 'a) -> Result<Buffer> {
+        let (horizon, width) = (self.config().method.plan.horizon, self.walk().columns.width());
+        let latent_dim = self.config().method.latent.dim();
+        let latent = |row: Row, out: &mut [f32]| row.window().latents().write_means(out);
+        let x = rows::gather(plans.clone(), [horizon, width], |row, out| row.window().write_plan(out))?;
+        let latents = (latent_dim > 0).then(|| rows::gather(plans, [horizon, latent_dim], latent)).transpose()?;
+        self.judge().worth(&x, latents.as_ref())
+    }
+
+    /// By the lesser of two critics, of the first actions in the state of now.
+    fn worth_of_actions<'a>(&self, critic: &Critic, candidates: impl Iterator<Item = Row<'a>> + Clone + 'a) -> Result<Buffer> {
+        let (layout, dim) = (self.config().layout, self.config().method.latent.dim());
+        let gather = |width: usize, write: &dyn Fn(Row<'a>) -> &'a [f32]| {
+            rows::gather(candidates.clone(), [1, width], |row, out| out.copy_from_slice(write(row)))
+        };
+        let state = gather(layout.state_dim, &|row| row.window().descent().known())?;
+        let action = gather(layout.action_dim, &|row| row.window().action(0))?;
+        let latent = (dim > 0).then(|| gather(dim, &|row| row.window().latents().mean_of_step(0))).transpose()?;
+        let [mut worth, other] = critic.q(&state, &action, latent.as_ref())?;
+        worth.iter_mut().zip(other.iter()).for_each(|(worth, other)| *worth = worth.min(*other));
+        Ok(worth)
+    }
+}
+
+/// The candidates of all acts that choose.
+fn candidates(acts: &[Act]) -> impl Iterator<Item = Row<'_>> + Clone {
+    let acts = acts.iter().filter(|act| act.asks(Ask::Choose));
+    acts.flat_map(|act| act.candidates().iter().map(move |window| Row::of(act, window)))
 }
 
 /// Adds gradients, one after the other, to the sums of the estimates that they belong to.

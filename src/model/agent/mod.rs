@@ -72,7 +72,7 @@ impl Agent {
         let columns = Columns::new(plan.diffused, config.layout);
         let (bounds, action_bounds) = (Bounds::new(&columns, plan.clip, &config.units), Bounds::of_actions(&config.units));
         let inverse = config.method.head.level_max().map(Process::cosine);
-        Self { process: Process::cosine(plan.level_max), inverse, columns, bounds, action_bounds, config, networks, spec }
+        Self { process: Process::new(plan.alpha, plan.level_max), inverse, columns, bounds, action_bounds, config, networks, spec }
     }
 
     /// What a client must know of it.

@@ -6,6 +6,7 @@ use crate::model::{
     config::ModelConfig,
     diffusion::descent::Walk,
     latent::{Evidence, Gaussian, GaussianRef, Tokens},
+    method::Diffused,
     nn::{Activations, Buffer},
     trajectory::TokenRef,
 };
@@ -112,19 +113,27 @@ pub(super) fn unread<'a>(acts: impl Iterator<Item = &'a Act> + Clone, config: &M
     Tokens::pack(config.layout, acts, 1, first, |act, _| act.unread().unwrap_or_default())
 }
 
-/// The last `steps` real steps (state, action) before each window, oldest first, zeros where unknown: `(B, 1, steps * (state_dim + action_dim))`.
-pub(super) fn observed<'a>(
-    rows: impl Iterator<Item = Row<'a>> + Clone + 'a,
-    steps: usize,
-    config: &ModelConfig,
-    walk: Walk,
-) -> Result<Buffer> {
-    let columns = Columns::state_action(config.layout);
-    gather(rows, [1, steps * columns.width()], |row, out| {
-        for (step, out) in out.chunks_exact_mut(columns.width()).enumerate() {
-            let TokenRef { state, action, .. } = row.act.past(row.window, steps - 1 - step, walk).unwrap_or_default();
+/// The real steps that the denoiser is given with each window ([`Diffusion::observed`]), oldest first, zeros where unknown: `(B, 1, steps * width)`;
+/// none of a model that takes none.
+///
+/// [`Diffusion::observed`]: crate::model::method::Diffusion::observed
+pub(super) fn observed<'a>(rows: impl Iterator<Item = Row<'a>> + Clone + 'a, config: &ModelConfig, walk: Walk) -> Result<Option<Buffer>> {
+    let (plan, columns) = (&config.method.plan, Columns::state_action(config.layout));
+    let [steps, width] = plan.observed(config.layout.widths());
+    let policy = plan.diffused == Diffused::Action;
+    let write = |row: Row<'a>, out: &mut [f32]| {
+        for (step, out) in out.chunks_exact_mut(width).enumerate() {
+            let TokenRef { state, action, .. } = match (policy, steps - 1 - step) {
+                (false, back) => row.act.past(row.window, back, walk).unwrap_or_default(),
+                (true, 0) => TokenRef { state: Some(row.window.descent().known()), ..TokenRef::default() },
+                (true, back) => row.act.real_past(back - 1).unwrap_or_default(),
+            };
             state.into_iter().for_each(|known| out[columns.state.clone()].copy_from_slice(known));
             action.into_iter().for_each(|known| out[columns.action.clone()].copy_from_slice(known));
+            if policy {
+                out[columns.width()] = plan.age(steps - 1 - step + row.window.descent().given_len());
+            }
         }
-    })
+    };
+    (steps > 0).then(|| gather(rows, [1, steps * width], write)).transpose()
 }

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::model::{
-    config::Restart,
+    config::{Restart, Units},
     method::Schedule,
     method::{Backbone, Future, GruLatent, Looks},
     nn::params::Params,
@@ -305,7 +305,8 @@ fn plain_sampler(agent: &Agent, state: &[f32], options: &SamplerOptions) -> Vec<
         let (from, to) = (4 * step, 4 * (step - 1));
         (0..3).for_each(|column| x[column] = f64::from(state[column]));
         let input = Tensor::from_vec(x.iter().map(|v| *v as f32).collect(), (1, 1, 5), &Device::Cpu).unwrap();
-        let condition = Given { levels: &[from as f32], latents: None, observed: None, told: None };
+        let levels = [from as f32];
+        let condition = Given::levels(&levels);
         let x0: Vec<f32> = agent.networks.denoiser.predict(&input, &condition).unwrap().flatten_all().unwrap().to_vec1().unwrap();
         let (a, b) = (agent.process.alpha_bar(from), agent.process.alpha_bar(to));
         let z = draw((step - 1) as u32, Slot::Jump);

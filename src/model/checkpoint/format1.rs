@@ -2,7 +2,7 @@
 
 use crate::model::{
     config::{Defaults, Missing, ModelConfig, Restart, Trained, Units},
-    method::{Backbone, Diffused, Diffusion, GruLatent, LatentSource, Looks, Method, Schedule, Target},
+    method::{AlphaBar, Backbone, Diffused, Diffusion, GruLatent, LatentSource, Looks, Method, Schedule, Target},
     normalizer::Normalizer,
     options::SamplerOptions,
     trajectory::Layout,
@@ -59,6 +59,7 @@ impl From<ConfigV1> for ModelConfig {
             horizon: old.plan_horizon,
             obs_horizon: old.obs_horizon,
             level_max: old.level_max,
+            alpha: AlphaBar::Cosine,
             diffused: Diffused::StateAction,
             target: Target::X0,
             schedule: Schedule::LADDER,

@@ -5,6 +5,7 @@ use crate::model::{
     golden::Golden,
     gradients::{Network, check},
     nn::{Activations, Buffer, Params, Traced, gradient, testing::gaussian},
+    trajectory::Layout,
 };
 use candle_core::{Result, Tensor};
 use std::ops::Range;
@@ -31,7 +32,7 @@ impl Network for Valued {
     fn run<V: Activations>(&self, value: &Value, inputs: &[V], rows: Range<usize>) -> Result<V> {
         let len = self.sizes.horizon;
         let levels = &self.levels[rows.start * len..rows.end * len];
-        value.predict(&inputs[0], &Given { levels, latents: inputs.get(1), observed: None, told: None })
+        value.predict(&inputs[0], &Given { latents: inputs.get(1), ..Given::levels(levels) })
     }
 }
 
@@ -54,18 +55,18 @@ fn values_against_pytorch() {
         let (golden, sizes) = (Golden::of(case), Sizes { columns: 5, latent_dim, horizon, widths });
         let levels = golden.flat("in.levels");
         golden.check_training(|given, params| {
-            let condition = Given { levels: &levels, latents: given.get("latents"), observed: None, told: None };
+            let condition = Given { latents: given.get("latents"), ..Given::levels(&levels) };
             Ok(vec![("value".into(), Value::new(sizes, LEVEL_MAX, params)?.predict(&given["x"], &condition)?)])
         });
         let (x, latents): (Buffer, Option<Buffer>) = (golden.value("in.x"), (latent_dim > 0).then(|| golden.value("in.latents")));
         golden.check_serving(|params| {
-            let condition = Given { levels: &levels, latents: latents.as_ref(), observed: None, told: None };
+            let condition = Given { latents: latents.as_ref(), ..Given::levels(&levels) };
             Ok(vec![("value".into(), Value::new(sizes, LEVEL_MAX, params)?.predict(&x, &condition)?)])
         });
         golden.check_guiding(|params| {
             let (value, given) = (Value::new(sizes, LEVEL_MAX, params)?, [latents.clone().unwrap_or_else(|| x.clone()), x.clone()]);
             let run = |[latents, x]: [Traced; 2]| {
-                value.predict(&x, &Given { levels: &levels, latents: (latent_dim > 0).then_some(&latents), observed: None, told: None })
+                value.predict(&x, &Given { latents: (latent_dim > 0).then_some(&latents), ..Given::levels(&levels) })
             };
             let (_, [to_latents, to_x]) = gradient(given, run, |_, grad| grad.copy_from_slice(&golden.flat("r.value")))?;
             let to_latents = (latent_dim > 0).then(|| ("latents".into(), to_latents));
@@ -82,7 +83,7 @@ fn wrong_sizes_are_errors() {
     let value = Value::new(sizes, LEVEL_MAX, &params).unwrap();
     let predict = |[len, columns]: [usize; 2], levels: usize, latents: Option<&Tensor>| {
         let (x, levels) = (gaussian(1, (1, len, columns)), vec![0.0; levels]);
-        value.predict(&x, &Given { levels: &levels, latents, observed: None, told: None }).map_err(|error| error.to_string())
+        value.predict(&x, &Given { latents, ..Given::levels(&levels) }).map_err(|error| error.to_string())
     };
     let latents = gaussian(2, (1, 4, 3));
     assert_eq!(predict([4, 2], 4, Some(&latents)).unwrap().dims(), [1, 1, 1]);
@@ -105,4 +106,42 @@ fn widths_that_do_not_fit_are_named() {
     assert_eq!(reason(&[8, 8], 1), field("the horizon 1 cannot be halved 1 times, once between two widths"));
     assert_eq!(reason(&[8; 4], 4), field("the horizon 4 cannot be halved 3 times, once between two widths"));
     assert_eq!(reason(&[8; 4], 0), field("the horizon 0 cannot be halved 3 times, once between two widths"));
+}
+
+/// Both critics of an action and that of the state, the errors and their gradients, with latents.
+#[test]
+fn critics_against_pytorch() {
+    let (golden, layout) = (Golden::of("critic"), Layout { state_dim: 3, action_dim: 2 });
+    golden.check_training(|given, params| {
+        let critic = Critic::new(layout, 4, 9, params)?;
+        let of = Transitions {
+            state: &given["state"],
+            action: &given["action"],
+            latent: given.get("latents"),
+            next_state: &given["next_state"],
+            next_latent: given.get("next_latents"),
+            reward: &given["gain"],
+            end_worth: -0.4,
+            ended: &given["ended"],
+        };
+        let [q1, q2] = critic.q(of.state, of.action, of.latent)?;
+        let v = critic.v(of.state, of.latent)?;
+        let CriticTerms { loss, q, v: of_v } = critic.errors(&critic, &of, (0.9, 0.7))?;
+        let named = [("q1", q1), ("q2", q2), ("v", v), ("loss", loss), ("loss_q", q), ("loss_v", of_v)];
+        Ok(named.map(|(name, value)| (name.to_owned(), value)).into())
+    });
+}
+
+/// What V is drawn to: of a fair coin's 0 and 1 the expectile tau is tau itself, where the error has no slope.
+#[test]
+fn an_expectile_is_where_the_error_is_flat() {
+    let coin = Tensor::new(&[0.0_f32, 1.0], &candle_core::Device::Cpu).unwrap().reshape((2, 1, 1)).unwrap();
+    for tau in [0.5, 0.7, 0.9] {
+        let slope = |v: f64| {
+            let v = candle_core::Var::from_tensor(&Tensor::full(v as f32, (2, 1, 1), &candle_core::Device::Cpu).unwrap()).unwrap();
+            let error = twin::expectile_error(&(&coin - v.as_tensor()).unwrap(), tau).unwrap();
+            error.backward().unwrap().get(&v).unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap()
+        };
+        assert!(slope(tau).abs() < 1e-6 && slope(tau - 0.05) < -1e-3 && slope(tau + 0.05) > 1e-3, "{tau}");
+    }
 }

@@ -1,24 +1,28 @@
 //! The denoiser epsilon_theta. It predicts x0 where a recipe says nothing else (section 4.3 and appendix A.5 of the paper; x0 rather than eps
 //! because the losses that touch the latents are x0 losses, and a rung of the ladder spans many levels).
 mod dit;
+mod encoder_decoder;
+mod residual;
 mod unet;
 
 use crate::model::{
     fit::{Unfit, WIDTH_MAX, require, size},
     method::{Backbone, Diffusion, History, Method},
-    nn::{Activation::Silu, Activations, Linear, params::Params},
+    nn::{Activation::Silu, Activations, Chance, Linear, params::Params},
     temporal::{EMB, LEVEL_CHANNELS, Levels, check_widths},
     trajectory::Layout,
 };
 use candle_core::Result;
 use dit::Dit;
+use encoder_decoder::EncoderDecoder;
+use residual::Residual;
 use unet::Unet;
 
 pub use crate::model::temporal::Given;
 
 /// Hidden width of the embedding of what holds for a whole window.
 const WHOLE_HIDDEN: usize = 128;
-const REAL_STEPS: &str = "the real steps before the window (obs_horizon > 1)";
+const REAL_STEPS: &str = "the real steps that it looks back on (obs_horizon)";
 
 /// Whether the sizes of a backbone fit together and the horizon of its plan.
 ///
@@ -38,18 +42,43 @@ pub(in crate::model) fn check(plan: &Diffusion) -> std::result::Result<(), Unfit
         Backbone::Dit { width, depth, heads, history } => {
             let tokens = *history == History::Vector || plan.obs_horizon > 1;
             require(tokens, field("history"), "is tokens, but there are no real steps before the window (method.plan.obs_horizon = 1)")?;
-            size(&field("width"), *width, WIDTH_MAX)?;
-            require(*width >= 4 && width.is_multiple_of(2), field("width"), format!("is {width}, must be even and at least 4"))?;
+            check_width(&field, *width)?;
             require(*depth <= dit::DEPTH_MAX, field("depth"), format!("is {depth}, must lie in 0..={}", dit::DEPTH_MAX))?;
             let divides = *heads >= 1 && width.is_multiple_of(*heads);
             require(divides, field("heads"), format!("is {heads}, must divide the width {width}"))
         }
+        Backbone::EncoderDecoder { width, depth, heads, encoder_depth, dropout } => {
+            check_width(&field, *width)?;
+            for (name, depth) in [("depth", depth), ("encoder_depth", encoder_depth)] {
+                require(*depth <= dit::DEPTH_MAX, field(name), format!("is {depth}, must lie in 0..={}", dit::DEPTH_MAX))?;
+            }
+            let divides = *heads >= 1 && width.is_multiple_of(*heads);
+            require(divides, field("heads"), format!("is {heads}, must divide the width {width}"))?;
+            check_dropout(&field, *dropout)
+        }
+        Backbone::Mlp { width, depth, dropout } => {
+            size(&field("width"), *width, WIDTH_MAX)?;
+            require(*depth <= dit::DEPTH_MAX, field("depth"), format!("is {depth}, must lie in 0..={}", dit::DEPTH_MAX))?;
+            check_dropout(&field, *dropout)
+        }
     }
+}
+
+fn check_dropout(field: &impl Fn(&str) -> String, share: f32) -> std::result::Result<(), Unfit> {
+    require((0.0..1.0).contains(&share), field("dropout"), format!("is {share}, must lie in 0..1"))
+}
+
+/// A width of tokens, which sinusoids fill in pairs.
+fn check_width(field: &impl Fn(&str) -> String, width: usize) -> std::result::Result<(), Unfit> {
+    size(&field("width"), width, WIDTH_MAX)?;
+    require(width >= 4 && width.is_multiple_of(2), field("width"), format!("is {width}, must be even and at least 4"))
 }
 
 enum Net {
     Unet(Box<Unet>),
     Dit(Box<Dit>),
+    EncoderDecoder(Box<EncoderDecoder>),
+    Mlp(Box<Residual>),
 }
 
 /// What a backbone is given: the input channels of each position, their levels, and a vector for the whole window.
@@ -60,8 +89,10 @@ struct Inputs<'a, V> {
     levels: &'a [f32],
     /// `(B, 1, emb)` embedding of the real steps, and of what is told.
     whole: Option<V>,
-    /// `(B, T_o - 1, state_dim + action_dim)` the real steps, where they are tokens.
+    /// `(B, steps, width)` the real steps, where they are tokens.
     history: Option<V>,
+    /// What training drops numbers by.
+    chance: Option<&'a Chance>,
 }
 
 /// The denoiser of a model.
@@ -81,18 +112,38 @@ impl Denoiser {
     /// # Errors
     /// If a loaded parameter is missing or of another shape.
     pub fn new(layout: Layout, method: &Method, params: &Params) -> Result<Self> {
-        let Diffusion { obs_horizon, level_max, backbone, .. } = &method.plan;
+        let Diffusion { horizon, level_max, backbone, .. } = &method.plan;
         let columns = method.plan.width(layout.widths());
         let d_in = columns + method.latent.dim() + LEVEL_CHANNELS;
-        let real_steps = obs_horizon.saturating_sub(1);
-        let tokens = if matches!(backbone, Backbone::Dit { history: History::Tokens, .. }) { real_steps } else { 0 };
+        let ([real_steps, step], told) = (method.plan.observed(layout.widths()), method.told_width());
+        let tokens = match backbone {
+            Backbone::Dit { history: History::Tokens, .. } | Backbone::EncoderDecoder { .. } => real_steps,
+            Backbone::Unet { .. } | Backbone::Dit { history: History::Vector, .. } | Backbone::Mlp { .. } => 0,
+        };
         let (net, emb) = match backbone {
             Backbone::Unet { widths } => (Net::Unet(Box::new(Unet::new(d_in, columns, widths, params)?)), EMB),
             Backbone::Dit { width, depth, heads, .. } => {
                 let sizes = [d_in, columns, *width];
-                let past = (tokens > 0).then(|| layout.dim());
-                let places = if tokens > 0 { (*level_max).max(tokens + method.plan.horizon) } else { *level_max };
+                let past = (tokens > 0).then_some(step);
+                let places = if tokens > 0 { (*level_max).max(tokens + horizon) } else { *level_max };
                 (Net::Dit(Box::new(Dit::new(sizes, [*depth, *heads], (places, past), params)?)), *width)
+            }
+            Backbone::EncoderDecoder { width, depth, heads, encoder_depth, dropout } => {
+                let sizes = encoder_decoder::Sizes {
+                    channels: [d_in, columns],
+                    horizon: *horizon,
+                    observed: [real_steps, step],
+                    told: told > 0,
+                    width: [*width, *heads],
+                    depths: [*encoder_depth, *depth],
+                    dropout: *dropout,
+                    level_max: *level_max,
+                };
+                (Net::EncoderDecoder(Box::new(EncoderDecoder::new(&sizes, params)?)), *width)
+            }
+            Backbone::Mlp { width, depth, dropout } => {
+                let net = Residual::new([d_in, columns, *horizon], [*width, *depth, *level_max], *dropout, params)?;
+                (Net::Mlp(Box::new(net)), *width)
             }
         };
         let embedding = |name: &str, width: usize| -> Result<Option<[Linear; 2]>> {
@@ -102,12 +153,11 @@ impl Denoiser {
             };
             (width > 0).then(layers).transpose()
         };
-        let told = method.told_width();
         Ok(Self {
             levels: Levels::new(*level_max)?,
             net,
             input_skip: Linear::new(d_in, columns, &params.scope("input_skip"))?,
-            observed: embedding("observed", (real_steps - tokens) * layout.dim())?,
+            observed: embedding("observed", (real_steps - tokens) * step)?,
             tokens,
             told: embedding("told", if told > 0 { told + 1 } else { 0 })?,
         })
@@ -124,10 +174,12 @@ impl Denoiser {
             (tokens, Some(observed)) => Some(observed.unflattened(tokens)?),
             (_, None) => candle_core::bail!("this denoiser needs {REAL_STEPS}"),
         };
-        let inputs = Inputs { x: &x, levels: given.levels, whole: self.embed_whole(given)?, history };
+        let inputs = Inputs { x: &x, levels: given.levels, whole: self.embed_whole(given)?, history, chance: given.chance };
         let out = match &self.net {
             Net::Unet(net) => net.forward(&inputs)?,
             Net::Dit(net) => net.forward(&inputs)?,
+            Net::EncoderDecoder(net) => net.forward(&inputs)?,
+            Net::Mlp(net) => net.forward(&inputs)?,
         };
         out.plus(&self.input_skip.forward(&x)?)
     }

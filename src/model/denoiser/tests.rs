@@ -4,7 +4,7 @@ use super::*;
 use crate::model::{
     config::ModelConfig,
     golden::Golden,
-    method::{GruLatent, Looks, Told},
+    method::{Diffused, GruLatent, Looks, Told},
     nn::{Buffer, Precision, kernels::testing::with_each_isa, testing::gaussian},
     noise::Philox,
     trajectory::Layout,
@@ -26,8 +26,15 @@ fn config(backbone: Backbone) -> ModelConfig {
     config
 }
 
-fn backbones() -> [Backbone; 3] {
-    [Backbone::Unet { widths: vec![24, 40, 72] }, Backbone::dit(36, 2, 3), with_tokens(36, 2, 3)]
+fn backbones() -> [Backbone; 5] {
+    let unet = Backbone::Unet { widths: vec![24, 40, 72] };
+    let mlp = Backbone::Mlp { width: 20, depth: 2, dropout: 0.3 };
+    [unet, Backbone::dit(36, 2, 3), with_tokens(36, 2, 3), encoder_decoder([36, 3], [1, 2]), mlp]
+}
+
+/// Width and heads, blocks of encoder and decoder.
+fn encoder_decoder([width, heads]: [usize; 2], [encoder_depth, depth]: [usize; 2]) -> Backbone {
+    Backbone::EncoderDecoder { width, depth, heads, encoder_depth, dropout: 0.3 }
 }
 
 /// A transformer that is told the real steps as tokens.
@@ -72,7 +79,7 @@ fn predict<V: Activations>(denoiser: &Denoiser, windows: &[Window]) -> V {
     let (x, latents) = (join([LEN, 5], |window| &window.x), join([LEN, LATENT], |window| &window.latents));
     let observed = join([1, OBSERVED], |window| &window.observed);
     let levels: Vec<f32> = windows.iter().flat_map(|window| window.levels.iter().copied()).collect();
-    denoiser.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: Some(&observed), told: None }).unwrap()
+    denoiser.predict(&x, &Given { latents: Some(&latents), observed: Some(&observed), ..Given::levels(&levels) }).unwrap()
 }
 
 fn bits(values: &[f32]) -> Vec<u32> {
@@ -131,13 +138,13 @@ fn networks_against_pytorch() {
         let (golden, config) = (Golden::of(case), golden_config(case));
         let levels = golden.flat("in.levels");
         golden.check_training(|given, params| {
-            let condition = Given { levels: &levels, latents: given.get("latents"), observed: given.get("observed"), told: None };
+            let condition = Given { latents: given.get("latents"), observed: given.get("observed"), ..Given::levels(&levels) };
             Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &config.method, params)?.predict(&given["x"], &condition)?)])
         });
         golden.check_serving(|params| {
             let latents: Option<Buffer> = config.method.latent.gru().is_some().then(|| golden.value("in.latents"));
             let observed: Option<Buffer> = (config.method.plan.obs_horizon > 1).then(|| golden.value("in.observed"));
-            let condition = Given { levels: &levels, latents: latents.as_ref(), observed: observed.as_ref(), told: None };
+            let condition = Given { latents: latents.as_ref(), observed: observed.as_ref(), ..Given::levels(&levels) };
             Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &config.method, params)?.predict(&golden.value("in.x"), &condition)?)])
         });
     }
@@ -147,8 +154,8 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     /// A row's bits are its own, whatever the batch, its place there, the processor's instructions, and how weights are held.
     #[test]
-    fn a_row_does_not_depend_on_its_batch(seeds in proptest::collection::vec(0_u64..1000, 1..40), unet: bool, half: bool) {
-        let denoiser = denoiser(backbones()[usize::from(!unet)].clone(), if half { Precision::Bf16 } else { Precision::F32 });
+    fn a_row_does_not_depend_on_its_batch(seeds in proptest::collection::vec(0_u64..1000, 1..40), which in 0_usize..5, half: bool) {
+        let denoiser = denoiser(backbones()[which].clone(), if half { Precision::Bf16 } else { Precision::F32 });
         let windows: Vec<Window> = seeds.into_iter().map(window).collect();
         let together = predict::<Buffer>(&denoiser, &windows);
         // Alone, and with every instruction set.
@@ -168,14 +175,90 @@ fn tokens_and_wishes_against_pytorch() {
     let levels = golden.flat("in.levels");
     golden.check_training(|given, params| {
         let [latents, observed, told] = ["latents", "observed", "told"].map(|name| given.get(name));
-        let condition = Given { levels: &levels, latents, observed, told };
+        let condition = Given { latents, observed, told, ..Given::levels(&levels) };
         Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &config.method, params)?.predict(&given["x"], &condition)?)])
     });
     let [x, latents, observed, told]: [Buffer; 4] = ["x", "latents", "observed", "told"].map(|name| golden.value(&format!("in.{name}")));
     golden.check_serving(|params| {
-        let condition = Given { levels: &levels, latents: Some(&latents), observed: Some(&observed), told: Some(&told) };
+        let condition = Given { latents: Some(&latents), observed: Some(&observed), told: Some(&told), ..Given::levels(&levels) };
         Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &config.method, params)?.predict(&x, &condition)?)])
     });
+}
+
+/// Policies of encoder and decoder: with latents, wishes and several real steps, with none of them, and with nothing to read but the level.
+#[test]
+fn policies_against_pytorch() {
+    for (case, horizon, steps, latent, backbone) in [
+        ("policy", 7, 3, 4, encoder_decoder([12, 3], [2, 2])),
+        ("policy_each", 5, 1, 0, encoder_decoder([10, 1], [0, 1])),
+        ("policy_alone", 3, 0, 3, encoder_decoder([6, 3], [0, 2])),
+    ] {
+        let (golden, latent) = (Golden::of(case), (latent > 0).then_some(GruLatent::plain(latent, 8, Looks::Block(4))));
+        let mut method = ModelConfig::plain(LAYOUT, latent, backbone).method;
+        (method.plan.horizon, method.plan.obs_horizon) = (horizon, steps.max(1));
+        method.plan.diffused = if steps > 0 { Diffused::Action } else { Diffused::StateAction };
+        method.told = if case == "policy" { vec![Told::Goal { columns: vec![0, 1] }] } else { Vec::new() };
+        let levels = golden.flat("in.levels");
+        golden.check_training(|given, params| {
+            let [latents, observed, told] = ["latents", "observed", "told"].map(|name| given.get(name));
+            let condition = Given { latents, observed, told, ..Given::levels(&levels) };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &method, params)?.predict(&given["x"], &condition)?)])
+        });
+        golden.check_serving(|params| {
+            let has = [method.latent.dim() > 0, steps > 0, !method.told.is_empty()];
+            let value = |(name, has): (&str, bool)| has.then(|| golden.value::<Buffer>(&format!("in.{name}")));
+            let [latents, observed, told] = [("latents", has[0]), ("observed", has[1]), ("told", has[2])].map(value);
+            let condition = Given { latents: latents.as_ref(), observed: observed.as_ref(), told: told.as_ref(), ..Given::levels(&levels) };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &method, params)?.predict(&golden.value("in.x"), &condition)?)])
+        });
+    }
+}
+
+/// Actors of residual blocks: one action with a latent, and three without.
+#[test]
+fn actors_against_pytorch() {
+    for (case, horizon, steps, latent, width) in [("actor", 1, 2, 4, 12), ("actor_plain", 3, 1, 0, 7)] {
+        let (golden, latents) = (Golden::of(case), (latent > 0).then_some(GruLatent::plain(latent, 8, Looks::Block(4))));
+        let mut method = ModelConfig::plain(LAYOUT, latents, Backbone::Mlp { width, depth: 2, dropout: 0.1 }).method;
+        (method.plan.horizon, method.plan.obs_horizon, method.plan.diffused) = (horizon, steps, Diffused::Action);
+        let levels = golden.flat("in.levels");
+        golden.check_training(|given, params| {
+            let condition = Given { latents: given.get("latents"), observed: given.get("observed"), ..Given::levels(&levels) };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &method, params)?.predict(&given["x"], &condition)?)])
+        });
+        golden.check_serving(|params| {
+            let latents: Option<Buffer> = (latent > 0).then(|| golden.value("in.latents"));
+            let observed: Buffer = golden.value("in.observed");
+            let condition = Given { latents: latents.as_ref(), observed: Some(&observed), ..Given::levels(&levels) };
+            Ok(vec![("x0".into(), Denoiser::new(LAYOUT, &method, params)?.predict(&golden.value("in.x"), &condition)?)])
+        });
+    }
+}
+
+/// A position looks at itself and those before it: what comes later in the window is nothing to it.
+#[test]
+fn later_positions_are_not_looked_at() {
+    let denoiser = denoiser(encoder_decoder([36, 3], [1, 2]), Precision::F32);
+    let one = window(3);
+    let mut other = one.clone();
+    other.x[5 * 5..].iter_mut().for_each(|value| *value += 1.0);
+    let [as_is, later] = [one, other].map(|window| predict::<Buffer>(&denoiser, &[window]).to_vec());
+    assert_eq!(bits(&as_is[..5 * 5]), bits(&later[..5 * 5]));
+    assert!(as_is[5 * 5..] != later[5 * 5..]);
+}
+
+/// By chance of one seed always the same numbers are dropped, of another other ones, and without chance none.
+#[test]
+fn training_drops_numbers_by_chance() {
+    let denoiser = denoiser(encoder_decoder([36, 3], [1, 2]), Precision::F32);
+    let said = |chance: Option<&Chance>| {
+        let (x, latents, observed) = (gaussian(1, (2, LEN, 5)), gaussian(2, (2, LEN, LATENT)), gaussian(3, (2, 1, OBSERVED)));
+        let levels = vec![7.0; 2 * LEN];
+        let given = Given { latents: Some(&latents), observed: Some(&observed), chance, ..Given::levels(&levels) };
+        denoiser.predict(&x, &given).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap()
+    };
+    let by = |seed| said(Some(&Chance::new(seed)));
+    assert!(by(1) == by(1) && by(1) != by(2) && by(1) != said(None));
 }
 
 /// Real steps that are tokens are attended to, each at its own place; a window without any is refused, in a recipe and in a forward.
@@ -193,5 +276,5 @@ fn real_steps_as_tokens() {
     assert_eq!(config.check().unwrap_err().field, "method.plan.backbone.history");
     let (x, levels) = (gaussian(1, (1, LEN, 5)), vec![1.0; LEN]);
     let latents = gaussian(2, (1, LEN, LATENT));
-    assert!(denoiser.predict(&x, &Given { levels: &levels, latents: Some(&latents), observed: None, told: None }).is_err());
+    assert!(denoiser.predict(&x, &Given { latents: Some(&latents), ..Given::levels(&levels) }).is_err());
 }

@@ -44,7 +44,7 @@ pub struct Window {
     pub x: Vec<f32>,
     /// Row of the table: READY, or above it after an act that a deadline cut short.
     pub row: usize,
-    /// The state it was built for, normalized.
+    /// The state it was built for, normalized; empty where actions alone are diffused.
     pub predicted_state: Vec<f32>,
 }
 
@@ -77,15 +77,16 @@ pub struct Descent {
 }
 
 impl Descent {
-    /// A window of `horizon` positions of `width` columns that has not begun; `known` is the real state.
-    pub fn new(sampling: Sampling, known: Vec<f32>, [horizon, width]: [usize; 2]) -> Self {
+    /// A window of `horizon` positions that has not begun; `known` is the real state.
+    pub fn new(sampling: Sampling, known: Vec<f32>, horizon: usize, columns: &Columns) -> Self {
+        let width = columns.width();
         Self {
             x: vec![0.0; horizon * width],
             x0: vec![0.0; horizon * width],
             dropped: 0,
             row: 0,
             given: Vec::with_capacity(sampling.actions * width),
-            predicted_state: vec![0.0; known.len()],
+            predicted_state: vec![0.0; columns.state.len()],
             eps: vec![0.0; width],
             evaluations: 0,
             passes: 0,
@@ -200,7 +201,7 @@ impl Descent {
         if self.evaluations > 0 { &self.x0[self.dropped * self.width()..] } else { &self.x[..self.x.len() - self.width()] }
     }
 
-    /// Estimate of the state after the last action that was given out.
+    /// Estimate of the state after the last action that was given out; empty where actions alone are diffused.
     pub fn predicted_state(&self) -> &[f32] {
         &self.predicted_state
     }

@@ -78,7 +78,8 @@ impl Judge<'_> {
         let worth = |[x]: [Traced; 1]| {
             let (latents, observed) = (constant(seat.latents.as_ref())?, constant(futures.observed.as_ref())?);
             let told = constant(futures.told.as_ref())?;
-            let given = Given { levels: &seat.levels, latents: latents.as_ref(), observed: observed.as_ref(), told: told.as_ref() };
+            let given =
+                Given { latents: latents.as_ref(), observed: observed.as_ref(), told: told.as_ref(), ..Given::levels(&seat.levels) };
             self.worth_of_denoised(&x, &given)
         };
         let (_, [mut gradient]) = gradient([self.noised(seat, futures)?], worth, |_, seed| self.seed(seed))?;
@@ -91,7 +92,7 @@ impl Judge<'_> {
     #[cfg(test)]
     pub(in crate::model) fn future_worth(self, seat: &Seat, futures: &Futures) -> Result<Buffer> {
         let (latents, observed) = (seat.latents.as_ref(), futures.observed.as_ref());
-        let given = Given { levels: &seat.levels, latents, observed, told: futures.told.as_ref() };
+        let given = Given { latents, observed, told: futures.told.as_ref(), ..Given::levels(&seat.levels) };
         let mut worth = self.worth_of_denoised(&self.noised(seat, futures)?, &given)?;
         let mut seed = worth.to_vec();
         self.seed(&mut seed);
@@ -139,7 +140,7 @@ impl Judge<'_> {
     /// `(B, 1, 1)` the value, or `(B, T, 1)` the reward of each step.
     fn worth_of<V: Activations>(self, x: &V, levels: &[f32], latents: Option<&V>) -> Result<V> {
         match (&self.networks.guide, &self.networks.latent) {
-            (Some(value), _) => value.predict(x, &Given { levels, latents, observed: None, told: None }),
+            (Some(value), _) => value.predict(x, &Given { latents, ..Given::levels(levels) }),
             (None, Some(latent)) => {
                 let columns = self.walk.columns;
                 let part = |columns: &std::ops::Range<usize>| x.channels(columns.start, columns.len());

@@ -1,7 +1,9 @@
-//! The diffusion process: cosine alpha-bar, q_sample, and jumps between levels (section 3 of the paper; Nichol and Dhariwal 2021).
+//! The diffusion process: alpha-bar, q_sample, and jumps between levels (section 3 of the paper).
 
-use crate::model::method::Target;
+use crate::model::method::{AlphaBar, Target};
 
+/// Betas of the variance-preserving process at its ends.
+const VP_BETAS: [f64; 2] = [0.1, 10.0];
 /// Largest beta of the cosine schedule.
 const BETA_MAX: f64 = 0.999;
 
@@ -23,6 +25,24 @@ pub struct Jump {
 }
 
 impl Process {
+    /// With `level_max` levels (K).
+    pub fn new(alpha: AlphaBar, level_max: usize) -> Self {
+        match alpha {
+            AlphaBar::Cosine => Self::cosine(level_max),
+            AlphaBar::VpLinear => Self::vp_linear(level_max),
+        }
+    }
+
+    /// `alpha-bar(u) = exp(-b0 u - (b1 - b0) u^2 / 2)` at `u = k / K` (Song et al. 2021, equation 33).
+    fn vp_linear(level_max: usize) -> Self {
+        let [low, high] = VP_BETAS;
+        let alpha_bar = |k: usize| {
+            let u = k as f64 / level_max as f64;
+            (-low * u - (high - low) * u * u / 2.0).exp()
+        };
+        Self { alpha_bar: (0..=level_max).map(alpha_bar).collect() }
+    }
+
     /// The cosine schedule with `level_max` levels (K).
     pub fn cosine(level_max: usize) -> Self {
         let f = |u: f64| (((u + 0.008) / 1.008) * std::f64::consts::FRAC_PI_2).cos().powi(2);
@@ -167,6 +187,20 @@ mod tests {
         let process = Process::cosine(40);
         let ((a1, b1), (a2, b2), (a, b)) = (process.renoise(3, 10), process.renoise(10, 30), process.renoise(3, 30));
         assert!((a1 * a2 - a).abs() < 1e-6 && ((a2 * b1).powi(2) + b2 * b2 - b * b).abs() < 1e-6);
+    }
+
+    /// The five levels of IDQL by its betas: `beta_t = 1 - exp(-b0 / T - (b1 - b0) (2 t - 1) / (2 T^2))`.
+    #[test]
+    fn five_levels_of_the_variance_preserving_process() {
+        let process = Process::new(AlphaBar::VpLinear, 5);
+        let mut product = 1.0;
+        for t in 1..=5 {
+            let beta = 1.0 - (-0.1 / 5.0 - 0.5 * 9.9 * (2.0 * f64::from(t) - 1.0) / 25.0).exp();
+            product *= 1.0 - beta;
+            assert!((process.alpha_bar(t as usize) - product).abs() < 1e-12, "level {t}");
+        }
+        assert!(process.alpha_bar(0) == 1.0 && process.alpha_bar(5) < 0.0065);
+        assert_eq!(Process::new(AlphaBar::Cosine, 40), Process::cosine(40));
     }
 
     /// With the true x0, a DDIM jump lands on the same noise at the new level.

@@ -13,6 +13,7 @@ use crate::model::{
     denoiser::Given,
     latent::{Evidence, Gaussian, LatentModel, Past, Tokens},
     method::{Diffusion, Target},
+    nn::Chance,
     trajectory::{Layout, Seen},
 };
 use candle_core::{Device, Result, Tensor};
@@ -64,12 +65,12 @@ pub struct WindowBatch {
     pub history_lens: Option<Vec<usize>>,
     /// `(B, T, state_dim + action_dim)` clean windows; position 0 is the current time.
     pub window: Tensor,
-    /// `(B, 1, (T_o - 1) * (state_dim + action_dim))` real steps before the window for the denoiser, zeros before the start; `None` if T_o = 1.
+    /// `(B, 1, steps * width)` real steps for the denoiser, of a model that takes some ([`Diffusion::observed`]); zeros before the start.
     pub observed: Option<Tensor>,
     /// Where each window stands.
     pub at: Vec<Standing>,
     /// Steps right before each window that the sampler would have imagined (`action_horizon > 1`); without any the state at position 0 is
-    /// the real one, and inpainted.
+    /// the real one, and inpainted. Where actions alone are diffused nobody imagines states: with any, that at position 0 is unknown.
     pub imagined: Vec<usize>,
     /// `(B, T, state_dim + action_dim)` Gaussian draws.
     pub noise: Tensor,
@@ -79,6 +80,8 @@ pub struct WindowBatch {
     pub truth: Option<Tensor>,
     /// `(B, 1, 1)` discounted mean of the rewards from position 0 on, standard deviations of the data; of methods that ask for returns.
     pub returns: Option<Tensor>,
+    /// Seed of what a network drops by chance; none where it drops nothing.
+    pub chance: Option<u64>,
 }
 
 impl WindowBatch {
@@ -115,6 +118,8 @@ impl WindowBatch {
             told: self.told.as_ref().map(cut).transpose()?,
             truth: self.truth.as_ref().map(cut).transpose()?,
             returns: self.returns.as_ref().map(cut).transpose()?,
+            // Parts of a batch have streams of their own.
+            chance: self.chance.map(|seed| seed.wrapping_add(start as u64)),
         })
     }
 }
@@ -170,11 +175,13 @@ impl Networks {
     pub fn refine_loss(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<RefineTerms> {
         let noised = Noised::new(plan, batch, options)?;
         let weights = loss_weights(plan, batch, options)?;
+        let chance = batch.chance.map(Chance::new);
         let mut loss = Tensor::new(0f32, &Device::Cpu)?;
         let (mut prior, mut posterior) = ((0.0, 0), (0.0, 0));
         for routed in self.route(batch, &noised, options.routing)? {
             let latents = routed.latents.map(|latents| if options.moves_latents { latents } else { latents.detach() });
-            let said = self.denoiser.predict(&noised.x, &noised.given(batch, latents.as_ref()))?;
+            let given = Given { chance: chance.as_ref(), ..noised.given(batch, latents.as_ref()) };
+            let said = self.denoiser.predict(&noised.x, &given)?;
             let error = ((said - &noised.aim)?.sqr()? * &weights)?.sum((1, 2))?;
             loss = (loss + error.mean_all()?.affine(routed.weight, 0.0)?)?;
             for (error, refined) in error.to_vec1::<f32>()?.into_iter().zip(routed.refined) {
@@ -223,7 +230,7 @@ impl Networks {
             return Ok(vec![Routed { latents: batch.truth.clone(), weight: 1.0, refined: vec![false; count] }]);
         };
         let past = latent.past(&batch.history, batch.history_lens.as_deref())?;
-        let prior = || prior_latents(latent, &past, batch);
+        let prior = || prior_latents(latent, &past, batch, &noised.columns);
         // A belief that is held is not refined: there is nothing that waits for the window.
         let routing = if latent.prior.is_some() { routing } else { LatentRouting::PriorOnly };
         Ok(match routing {
@@ -236,7 +243,7 @@ impl Networks {
                 vec![Routed { latents: Some(latents), weight: 1.0, refined: noised.ready.clone() }]
             }
             LatentRouting::Literal => vec![
-                Routed { latents: Some(teacher_forced_latents(latent, batch)?), weight: 1.0, refined: vec![true; count] },
+                Routed { latents: Some(teacher_forced_latents(latent, batch, &noised.columns)?), weight: 1.0, refined: vec![true; count] },
                 Routed { latents: Some(prior()?), weight: LITERAL_PRIOR_WEIGHT, refined: vec![false; count] },
             ],
         })
@@ -244,8 +251,8 @@ impl Networks {
 }
 
 /// Prior roll-out from real history and the current state: what a sampler above READY has.
-fn prior_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch) -> Result<Tensor> {
-    let current = window_tokens(whole(&batch.columns()?), &batch.window, Evidence::Filter.ahead(), None)?;
+fn prior_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch, diffused: &Columns) -> Result<Tensor> {
+    let current = window_tokens(batch, diffused, (&batch.window, &batch.columns()?), Evidence::Filter.ahead(), None)?;
     let filter = latent.infer_after(past, &current)?;
     chain_means(latent, filter, Vec::new(), batch.window.dim(1)?)
 }
@@ -254,7 +261,7 @@ fn prior_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch) -> Resu
 fn refined_latents(latent: &LatentModel, past: &Past, batch: &WindowBatch, noised: &Noised) -> Result<Tensor> {
     let len = batch.window.dim(1)?;
     let Seat { x, sigma } = &noised.refined_from;
-    let tokens = window_tokens([&noised.columns, &batch.columns()?], x, Evidence::Refinement.ahead_within(len), Some(sigma))?;
+    let tokens = window_tokens(batch, &noised.columns, (x, &noised.columns), Evidence::Refinement.ahead_within(len), Some(sigma))?;
     let posterior = latent.infer_after(past, &tokens)?;
     let head = posterior.mean.clone();
     chain_means(latent, posterior, vec![head], len - 1)
@@ -271,38 +278,51 @@ fn chain_means(latent: &LatentModel, start: Gaussian, head: Vec<Tensor>, len: us
 }
 
 /// Posteriors of every position from the clean window itself; the last position, which has no successor, keeps the prior.
-fn teacher_forced_latents(latent: &LatentModel, batch: &WindowBatch) -> Result<Tensor> {
+fn teacher_forced_latents(latent: &LatentModel, batch: &WindowBatch, diffused: &Columns) -> Result<Tensor> {
     let (len, before) = (batch.window.dim(1)?, batch.history.batch_len()?.1);
-    let tokens = batch.history.concat(&window_tokens(whole(&batch.columns()?), &batch.window, &vec![Seen::GENERATED; len], None)?)?;
+    let window = window_tokens(batch, diffused, (&batch.window, &batch.columns()?), &vec![Seen::GENERATED; len], None)?;
+    let tokens = batch.history.concat(&window)?;
     let seen = tokens.narrow(1, before + len - 1)?.present;
     let posteriors = latent.posteriors(&tokens, &tokens.present, &seen)?.narrow(before, len - 1)?;
     let last = latent.coming(posteriors.narrow(len - 2, 1)?)?;
     Tensor::cat(&[posteriors.mean, last.mean], 1)
 }
 
-/// Windows of all columns.
-fn whole(columns: &Columns) -> [&Columns; 2] {
-    [columns; 2]
-}
-
-/// The first positions of the windows `x` as tokens, of which this is seen; of windows of states no action is, which tokens have all the same.
-fn window_tokens([columns, all]: [&Columns; 2], x: &Tensor, seen: &[Seen], sigma: Option<&Tensor>) -> Result<Tokens> {
-    let (rows, len, states_alone) = (x.dim(0)?, seen.len(), columns.action.is_empty());
-    let flags: Vec<f32> = seen.iter().flat_map(|seen| Seen { action: seen.action && !states_alone, ..*seen }.flags()).collect();
-    let present = Tensor::from_vec(flags, (1, len, 3), x.device())?.broadcast_as((rows, len, 3))?.contiguous()?;
-    let part = |columns: &Range<usize>, index| {
-        let part = x.narrow(1, 0, len)?.narrow(2, columns.start, columns.len())?.contiguous()?;
+/// The first positions of the windows `x`, of these columns, as tokens, of which this is seen. Of windows of states no action is; of windows of
+/// actions the current state alone is, where it is the real one: `diffused` says what a sampler has.
+fn window_tokens(
+    batch: &WindowBatch,
+    diffused: &Columns,
+    (x, columns): (&Tensor, &Columns),
+    seen: &[Seen],
+    sigma: Option<&Tensor>,
+) -> Result<Tokens> {
+    let (rows, len, Layout { state_dim, action_dim }) = (x.dim(0)?, seen.len(), batch.layout()?);
+    let has_state = |row: usize, position: usize| !diffused.state.is_empty() || position == 0 && batch.imagined[row] == 0;
+    let mut flags = Vec::with_capacity(rows * len * 3);
+    for row in 0..rows {
+        for (position, seen) in seen.iter().enumerate() {
+            let (state, action) = (seen.state && has_state(row, position), seen.action && !columns.action.is_empty());
+            flags.extend(Seen { state, action, ..*seen }.flags());
+        }
+    }
+    let present = Tensor::from_vec(flags, (rows, len, 3), x.device())?;
+    let part = |of: &Tensor, columns: &Range<usize>, index| {
+        let part = of.narrow(1, 0, len)?.narrow(2, columns.start, columns.len())?.contiguous()?;
         part.broadcast_mul(&present.narrow(2, index, 1)?)
     };
-    let zeros = Tensor::zeros((rows, len, 1), x.dtype(), x.device())?;
+    let zeros = |width: usize| Tensor::zeros((rows, len, width), x.dtype(), x.device());
     Ok(Tokens {
-        state: part(&columns.state, 0)?,
-        action: match states_alone {
-            true => Tensor::zeros((rows, len, all.action.len()), x.dtype(), x.device())?,
-            false => part(&columns.action, 1)?,
+        state: match columns.state.is_empty() {
+            true => part(&batch.window, &(0..state_dim), 0)?,
+            false => part(x, &columns.state, 0)?,
         },
-        reward: zeros.clone(),
-        noise: sigma.map_or(Ok(zeros), |sigma| sigma.narrow(1, 0, len)?.contiguous())?,
+        action: match columns.action.is_empty() {
+            true => zeros(action_dim)?,
+            false => part(x, &columns.action, 1)?,
+        },
+        reward: zeros(1)?,
+        noise: sigma.map_or_else(|| zeros(1), |sigma| sigma.narrow(1, 0, len)?.contiguous())?,
         present,
         before: None,
         surprises: None,
@@ -312,7 +332,7 @@ fn window_tokens([columns, all]: [&Columns; 2], x: &Tensor, seen: &[Seen], sigma
 impl Noised {
     fn new(plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<Self> {
         let table = Table::of(plan, options.sub_steps).map_err(candle_core::Error::Msg)?;
-        let (process, columns) = (Process::cosine(plan.level_max), Columns::new(plan.diffused, batch.layout()?));
+        let (process, columns) = (Process::new(plan.alpha, plan.level_max), Columns::new(plan.diffused, batch.layout()?));
         // Rows below READY; none for a window above it.
         let below_ready = |standing: &Standing| match (standing, table.ready()) {
             (Standing::Row(row), Some(ready)) => row.checked_sub(ready),
@@ -341,13 +361,13 @@ impl Noised {
 
     /// What a network is given with it.
     pub(super) fn given<'a>(&'a self, batch: &'a WindowBatch, latents: Option<&'a Tensor>) -> Given<'a, Tensor> {
-        Given { levels: &self.levels, latents, observed: batch.observed.as_ref(), told: batch.told.as_ref() }
+        Given { latents, observed: batch.observed.as_ref(), told: batch.told.as_ref(), ..Given::levels(&self.levels) }
     }
 }
 
 /// The columns of these of a batch that are diffused, `(B, T, D)`.
 fn diffused(steps: &Tensor, columns: &Columns) -> Result<Tensor> {
-    if steps.dim(2)? == columns.width() { Ok(steps.clone()) } else { steps.narrow(2, 0, columns.width())?.contiguous() }
+    if steps.dim(2)? == columns.width() { Ok(steps.clone()) } else { steps.narrow(2, columns.of_step.start, columns.width())?.contiguous() }
 }
 
 /// What the denoiser should say at these levels.

@@ -53,6 +53,7 @@ fn batch(window: Vec<f32>, noise: Vec<f32>, row: usize) -> WindowBatch {
         told: None,
         truth: None,
         returns: None,
+        chance: None,
     }
 }
 
@@ -119,7 +120,7 @@ fn loss_is_the_weighted_mean_square() {
     let batch = batch(values(1), values(2), 2);
     let options = options(LatentRouting::Matched);
     let noised = Noised::new(&config.method.plan, &batch, &options).unwrap();
-    let condition = Given { levels: &noised.levels, latents: None, observed: None, told: None };
+    let condition = Given::levels(&noised.levels);
     let x0: Vec<f32> = networks.denoiser.predict(&noised.x, &condition).unwrap().flatten_all().unwrap().to_vec1().unwrap();
     let (mut sum, mut weight) = (0.0, 0.0);
     for (index, (x0, clean)) in x0.iter().zip(values(1)).enumerate() {

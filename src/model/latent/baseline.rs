@@ -2,10 +2,10 @@
 //! inferred from and has to explain: a context moves a state or an action by a few per cent of what everybody knows of it, which is too little to
 //! pay for its bits in the ELBO, and all there is of a surprise.
 
-use super::{Surprises, Tokens, mlp::Mlp};
+use super::{Surprises, Tokens};
 use crate::model::{
     nn::{
-        Activations, Linear,
+        Activations, Linear, Mlp,
         params::{Init, Params},
     },
     trajectory::Layout,

@@ -1,9 +1,9 @@
 //! Prior and decoder (appendix A.4 of the paper: 2-layer MLPs).
 
-use super::{Gaussian, gaussian::LOG_VAR, mlp::Mlp};
+use super::{Gaussian, gaussian::LOG_VAR};
 use crate::model::{
     method::GruLatent,
-    nn::{Activations, Linear, params::Params},
+    nn::{Activations, Linear, Mlp, params::Params},
     trajectory::Layout,
 };
 use candle_core::Result;

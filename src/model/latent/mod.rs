@@ -5,7 +5,6 @@ mod encoder;
 mod evidence;
 mod gaussian;
 mod heads;
-mod mlp;
 mod tokens;
 
 pub use baseline::{Baseline, ContextFreeTerms, WHITENERS};

@@ -45,7 +45,23 @@ pub trait Activations: Clone {
     /// # Errors
     /// If the channels are not q, k, v of `heads` heads.
     fn attention(&self, heads: usize) -> Result<Self> {
-        self.run(&Layer::plain(Op::Attention { heads }), &[])
+        self.run(&Layer::plain(Op::Attention { heads, causal: false }), &[])
+    }
+
+    /// The same, where a step looks only at itself and those before it.
+    ///
+    /// # Errors
+    /// As of [`Self::attention`].
+    fn causal_attention(&self, heads: usize) -> Result<Self> {
+        self.run(&Layer::plain(Op::Attention { heads, causal: true }), &[])
+    }
+
+    /// Multi-head attention of these queries, `(batch, steps, width)`, on others' k, v side by side, `(batch, others, 2 width)`.
+    ///
+    /// # Errors
+    /// If the heads do not divide the width, or the widths do not fit each other.
+    fn attending(&self, others: &Self, heads: usize) -> Result<Self> {
+        self.run(&Layer::plain(Op::Cross { heads }), &[others])
     }
 
     /// An activation, element by element.
@@ -154,6 +170,14 @@ pub trait Activations: Clone {
     /// If shapes differ.
     fn minus(self, other: &Self) -> Result<Self> {
         self.run_in_place(&Layer::plain(Op::Subtract), &[other])
+    }
+
+    /// `self * other`, element by element.
+    ///
+    /// # Errors
+    /// If shapes differ.
+    fn times(self, other: &Self) -> Result<Self> {
+        self.run_in_place(&Layer::plain(Op::Times), &[other])
     }
 
     /// Rows where `present` (`(batch, steps, 1)`) is 1, the learned vector where it is 0.

@@ -172,7 +172,35 @@ fn attention_against_central_differences() {
         check_gradients(std::slice::from_ref(&qkv), &|inputs| inputs[0].attention(heads));
         check_rows(std::slice::from_ref(&qkv), &|inputs| inputs[0].attention(heads));
         assert_eq!(bits(&scrambled(&qkv, 1, 2).attention(heads).unwrap()), bits(&qkv.attention(heads).unwrap()));
+        check_gradients(std::slice::from_ref(&qkv), &|inputs| inputs[0].causal_attention(heads));
+        check_rows(std::slice::from_ref(&qkv), &|inputs| inputs[0].causal_attention(heads));
     }
+}
+
+/// Each step sees what it would see if the later ones were not there.
+#[test]
+fn causal_attention_is_that_of_the_steps_so_far() {
+    let qkv = gaussian(1, (2, 19, 18));
+    let all = qkv.causal_attention(2).unwrap();
+    for len in [1, 2, 8, 19] {
+        let so_far = qkv.narrow(1, 0, len).unwrap().contiguous().unwrap().attention(2).unwrap();
+        let (last, expected) = (all.narrow(1, len - 1, 1).unwrap(), so_far.narrow(1, len - 1, 1).unwrap());
+        assert!(distance(&flat(&last), &flat(&expected)) < 1e-6, "{len}");
+    }
+}
+
+#[test]
+fn attention_on_others_against_central_differences() {
+    for (batch, queries, keys, heads, head_dim) in [(2, 3, 5, 2, 4), (2, 17, 2, 1, 3), (1, 1, 18, 3, 17)] {
+        let width = heads * head_dim;
+        let inputs = [gaussian(1, (batch, queries, width)), gaussian(2, (batch, keys, 2 * width))];
+        check_gradients(&inputs, &|inputs| inputs[0].attending(&inputs[1], heads));
+        check_rows(&inputs, &|inputs| inputs[0].attending(&inputs[1], heads));
+    }
+    // On themselves it is self-attention.
+    let qkv = gaussian(3, (2, 7, 24));
+    let [q, kv] = [(0, 8), (8, 16)].map(|(start, len)| qkv.narrow(2, start, len).unwrap().contiguous().unwrap());
+    assert_eq!(bits(&q.attending(&kv, 2).unwrap()), bits(&qkv.attention(2).unwrap()));
 }
 
 #[test]
@@ -230,6 +258,14 @@ fn differences_against_central_differences() {
 }
 
 #[test]
+fn element_products_against_central_differences() {
+    let (x, y) = (gaussian(1, (2, 3, 5)), gaussian(2, (2, 3, 5)));
+    let function = |inputs: &[Tensor]| inputs[0].clone().times(&inputs[1]);
+    check_gradients(&[x.clone(), y.clone()], &function);
+    assert_eq!(bits(&function(&[x.clone(), y.clone()]).unwrap()), bits(&(&x * &y).unwrap()));
+}
+
+#[test]
 fn activations_against_central_differences() {
     for activation in [Mish, Silu, GeluTanh, Relu, Clamp(-2.0, 0.0)] {
         // No value within a step of a corner.
@@ -274,6 +310,10 @@ fn wrong_shapes_are_errors() {
     assert!(GroupNormMish::new(3, 8, &p).is_err());
     assert!(LayerNorm::new(8, true, 1e-5, &p.scope("norm")).unwrap().forward(&gaussian(1, (2, 1, 4))).is_err());
     assert!(gaussian(1, (2, 4, 8)).attention(2).is_err());
+    assert!(gaussian(1, (2, 4, 8)).attending(&gaussian(1, (2, 3, 8)), 2).is_err());
+    assert!(gaussian(1, (2, 4, 8)).attending(&gaussian(1, (1, 3, 16)), 2).is_err());
+    assert!(gaussian(1, (2, 4, 8)).attending(&gaussian(1, (2, 3, 16)), 3).is_err());
+    assert!(gaussian(1, (2, 4, 8)).times(&gaussian(1, (2, 4, 7))).is_err());
     assert!(Tensor::beside(&[&gaussian(1, (2, 4, 8)), &gaussian(1, (2, 3, 8))]).is_err());
     assert!(gaussian(1, (2, 4, 8)).plus_at_each_step(&gaussian(1, (2, 1, 7))).is_err());
     assert!(gaussian(1, (2, 4, 8)).channels(6, 3).is_err());

@@ -2,7 +2,7 @@
 //! U-Net.
 mod blocks;
 
-use crate::model::nn::{Activations, time_embedding::Sinusoid};
+use crate::model::nn::{Activations, Chance, time_embedding::Sinusoid};
 use candle_core::Result;
 
 pub(in crate::model) use blocks::{ConvBlock, Down, EMB, MeanLevel, ResBlock, check_widths, through};
@@ -16,10 +16,19 @@ pub struct Given<'a, V> {
     pub levels: &'a [f32],
     /// `(B, T, latent_dim)`, for models with latents.
     pub latents: Option<&'a V>,
-    /// `(B, 1, (T_o - 1) * (state_dim + action_dim))` real steps, for models with `obs_horizon > 1`.
+    /// `(B, 1, steps * width)` real steps, for models that take some: [`crate::model::method::Diffusion::observed`].
     pub observed: Option<&'a V>,
     /// `(B, 1, told_width + 1)` what is told of what is wanted, normalized, and 1; zeros where nothing is told. For models that take it.
     pub told: Option<&'a V>,
+    /// Where a training's chance comes from, for networks that drop numbers by it; none in use.
+    pub chance: Option<&'a Chance>,
+}
+
+impl<'a, V> Given<'a, V> {
+    /// The levels, and nothing else.
+    pub fn levels(levels: &'a [f32]) -> Self {
+        Self { levels, latents: None, observed: None, told: None, chance: None }
+    }
 }
 
 /// The level of each position, as channels of it.

@@ -1,11 +1,14 @@
 //! Offline trajectories: read, checked, split by episodes, brought to the units of the networks.
 pub mod beside;
+pub mod blocks;
 pub mod hdf5;
 pub mod hidden;
+pub mod places;
 pub mod returns;
 pub mod room;
 pub mod rows;
 pub mod surprises;
+pub mod tokens;
 pub mod units;
 pub mod window;
 
@@ -94,6 +97,8 @@ pub struct Span {
     pub rows: Range<usize>,
     /// Whether it shows what comes of actions and is nothing to imitate.
     pub play: bool,
+    /// Whether it ended by what happened (`terminals`), and not because time was up.
+    pub ended: bool,
     /// The rows of the episode that it follows in its session, if there is one, but the last: a session is never told what came of an
     /// episode's last act.
     pub before: Option<Range<usize>>,

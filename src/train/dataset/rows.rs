@@ -207,6 +207,8 @@ pub struct Episode {
     pub context_dim: usize,
     /// Whether it shows what comes of actions and is nothing to imitate.
     pub play: bool,
+    /// Whether it ended by what happened, and not because time was up.
+    pub ended: bool,
     fields: Arc<Fields>,
     /// How surprising each row of the fields is, where that was found out; see [`super::surprises`].
     surprises: Option<Arc<Field>>,
@@ -216,9 +218,9 @@ pub struct Episode {
 
 impl Episode {
     /// The rows of `span`.
-    pub fn new(fields: &Arc<Fields>, Span { rows, play, before }: Span) -> Self {
+    pub fn new(fields: &Arc<Fields>, Span { rows, play, ended, before }: Span) -> Self {
         let (layout, context_dim) = (fields.layout(), fields.context.width);
-        Self { layout, context_dim, play, fields: fields.clone(), surprises: None, rows, before }
+        Self { layout, context_dim, play, ended, fields: fields.clone(), surprises: None, rows, before }
     }
 
     /// Other rows of the same data set.
@@ -255,7 +257,7 @@ impl Episode {
     #[cfg(test)]
     pub fn of(layout: Layout, columns: [Vec<f32>; 4]) -> Self {
         let all = columns[2].len();
-        Self::among(layout, columns, Span { rows: 0..all, play: false, before: None })
+        Self::among(layout, columns, Span { rows: 0..all, play: false, ended: false, before: None })
     }
 
     /// An episode among others, whose rows are those of the columns.

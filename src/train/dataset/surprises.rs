@@ -5,7 +5,7 @@ use super::{
     Episode, Sides, Span,
     room::Room,
     rows::{FieldWriter, pieces, surprise_width},
-    window::TokenRows,
+    tokens::TokenRows,
 };
 use crate::{
     model::{
@@ -36,7 +36,7 @@ fn by_pieces(piece: usize, sides: &Sides, baseline: &Baseline, room: &Room) -> R
     let rows = all().map(Episode::end).max().unwrap_or(0);
     let first = all().next().context("a data set without episodes: is a bug")?;
     // As if all rows were of one episode: who reads an episode's first step knows nothing of the one before it, so nobody looks at its arrival.
-    let every = first.of_rows(Span { rows: 0..rows, play: false, before: None });
+    let every = first.of_rows(Span { rows: 0..rows, play: false, ended: false, before: None });
     let width = surprise_width(first.layout);
     let in_file = first.in_file() || 4 * (rows * (first.columns() + width)) as u64 > room.memory_bytes;
     let mut writer = FieldWriter::new(width, rows, room, in_file)?;
@@ -99,8 +99,8 @@ mod tests {
     fn the_same_of_any_pieces() {
         let numbers = |count: usize, scale: f32| (0..count).map(|i| scale * (i as f32 * 0.7).sin()).collect::<Vec<f32>>();
         let columns = [numbers(ROWS * 3, 2.0), numbers(ROWS * 2, 1.0), numbers(ROWS, 1.0), Vec::new()];
-        let first = Episode::among(LAYOUT, columns, Span { rows: 0..9, play: false, before: None });
-        let second = first.of_rows(Span { rows: 9..ROWS, play: true, before: None });
+        let first = Episode::among(LAYOUT, columns, Span { rows: 0..9, play: false, ended: false, before: None });
+        let second = first.of_rows(Span { rows: 9..ROWS, play: true, ended: false, before: None });
         let sides = Sides { train: vec![second], held_out: vec![first] };
         let (networks, scratch) = (networks(), tempfile::tempdir().unwrap());
         let baseline = networks.latent.as_ref().and_then(|latent| latent.baseline.as_ref()).unwrap();

@@ -2,8 +2,15 @@
 
 use super::*;
 use crate::{
-    model::method::Schedule,
-    train::dataset::{Sides, Span, Which},
+    model::{
+        config::ModelConfig,
+        method::{Backbone, Schedule},
+        trajectory::Layout,
+    },
+    train::dataset::{
+        Sides, Span, Which,
+        blocks::{BlockShape, blocks},
+    },
 };
 
 const LAYOUT: Layout = Layout { state_dim: 2, action_dim: 1 };
@@ -20,7 +27,24 @@ fn episodes() -> Vec<Episode> {
 
 /// Of eight tokens, nothing hidden.
 fn block_shape(batch: usize, looks: Looks) -> BlockShape {
-    BlockShape { batch, len: 8, looks, latent_dim: 2, stays: false, context: None, show_action: 0.5, show_reward: 0.5, hide: Hide::NOTHING }
+    BlockShape {
+        batch,
+        len: 8,
+        looks,
+        latent_dim: 2,
+        stays: false,
+        context: None,
+        show_action: 0.5,
+        show_reward: 0.5,
+        mask_state: 0.0,
+        hide: Hide::NOTHING,
+    }
+}
+
+/// Of four positions, beside so many real steps.
+fn plan(obs_horizon: usize) -> Diffusion {
+    let plan = ModelConfig::plain(LAYOUT, None, Backbone::Unet { widths: vec![8] }).method.plan;
+    Diffusion { horizon: 4, obs_horizon, ..plan }
 }
 
 fn row_of(standing: &Standing) -> usize {
@@ -73,9 +97,8 @@ fn windows_follow_their_history() {
     let episodes = episodes();
     let shape = WindowShape {
         batch: 300,
-        horizon: 4,
         looks: Looks::Block(3),
-        obs_horizon: 3,
+        plan: plan(3),
         table: Table::new(Schedule::LADDER, [0, 4], 2, 8).unwrap(),
         levels: Levels::Schedule,
         action_horizons: vec![3],
@@ -128,9 +151,8 @@ fn hidden_fields_are_hidden_from_both_networks() {
     let (episodes, hide) = (episodes(), Hide { state: 0.5, action: 0.5, reward: 0.5 });
     let shape = WindowShape {
         batch: 400,
-        horizon: 4,
         looks: Looks::Block(3),
-        obs_horizon: 3,
+        plan: plan(3),
         table: Table::new(Schedule::LADDER, [0, 4], 1, 8).unwrap(),
         levels: Levels::Schedule,
         action_horizons: vec![1, 2],
@@ -168,6 +190,7 @@ fn hidden_fields_are_hidden_from_both_networks() {
         context: None,
         show_action: 1.0,
         show_reward: 1.0,
+        mask_state: 0.0,
         hide,
     };
     let batch = blocks(&episodes, &Places::new(&episodes, 0, 8), &shape, &mut Philox::new(1)).unwrap();
@@ -187,9 +210,8 @@ fn levels_may_be_drawn_one_by_one() {
     let (episodes, uniform) = (episodes(), Table::new(Schedule::Uniform { steps: 5 }, [0, 4], 1, 8).unwrap());
     let shape = |table, levels| WindowShape {
         batch: 300,
-        horizon: 4,
         looks: Looks::Block(3),
-        obs_horizon: 1,
+        plan: plan(1),
         table,
         levels,
         action_horizons: vec![1, 2],
@@ -216,7 +238,11 @@ fn following() -> Episode {
 
 fn following_as(play: bool) -> Episode {
     let states = (0..17).flat_map(|row| if row < 5 { [row as f32, 0.0] } else { [(95 + row) as f32, 0.0] }).collect();
-    Episode::among(LAYOUT, [states, vec![0.5; 17], vec![0.25; 17], Vec::new()], Span { rows: 5..17, play, before: Some(0..4) })
+    Episode::among(
+        LAYOUT,
+        [states, vec![0.5; 17], vec![0.25; 17], Vec::new()],
+        Span { rows: 5..17, play, ended: false, before: Some(0..4) },
+    )
 }
 
 #[test]
@@ -260,9 +286,8 @@ fn windows_cross_the_border() {
     let (episodes, table) = (vec![following()], Table::new(Schedule::LADDER, [0, 4], 1, 8).unwrap());
     let shape = WindowShape {
         batch: 400,
-        horizon: 4,
         looks: Looks::Running,
-        obs_horizon: 3,
+        plan: plan(3),
         table,
         levels: Levels::Schedule,
         action_horizons: vec![1],
@@ -303,4 +328,42 @@ fn play_is_told_from_demonstrations() {
     let sides = Sides { train: [true, false, true].map(following_as).to_vec(), held_out: vec![following_as(false)] };
     let count = |which| (sides.only(which).train.len(), sides.only(which).held_out.len());
     assert_eq!([Which::All, Which::Play, Which::Demonstrations].map(count), [(3, 1), (2, 0), (1, 1)]);
+}
+
+/// Each step but the last of an episode, and that one too where something ended it; the next window is that of the step after, whose history has
+/// the step itself, or where there is none, the same again.
+#[test]
+fn transitions_follow_one_another() {
+    let whole = episodes();
+    let mut ending = whole[1].clone();
+    ending.ended = true;
+    let episodes = vec![whole[0].clone(), ending];
+    let shape = WindowShape {
+        batch: 400,
+        looks: Looks::Block(3),
+        plan: Diffusion { horizon: 1, diffused: Diffused::Action, ..plan(1) },
+        table: Table::new(Schedule::Uniform { steps: 5 }, [0, 1], 1, 8).unwrap(),
+        levels: Levels::Schedule,
+        action_horizons: vec![1],
+        ready_fraction: 0.0,
+        hide: Hide::NOTHING,
+        beside: Beside::default(),
+    };
+    let batch = transitions(&episodes, &Places::of_transitions(&episodes), &shape, &mut Philox::new(2)).unwrap();
+    let [now, next] = [&batch.now, &batch.next].map(|windows| rows(&windows.window));
+    let last = |windows: &WindowBatch| rows(&windows.history.state).into_iter().map(|row| row[2][0]).collect::<Vec<_>>();
+    let (before_now, before_next) = (last(&batch.now), last(&batch.next));
+    let mut seen = std::collections::BTreeSet::new();
+    for row in 0..400 {
+        let (state, later) = (now[row][0][0], next[row][0][0]);
+        seen.insert(state as usize);
+        assert_eq!(batch.rewards[row], -(state % 100.0));
+        assert_eq!(batch.ended[row], state == 211.0);
+        if batch.ended[row] {
+            assert_eq!((later, before_next[row]), (state, before_now[row]));
+        } else {
+            assert_eq!((later, before_next[row]), (state + 1.0, state));
+        }
+    }
+    assert_eq!(seen, (100..108).chain(200..212).collect());
 }

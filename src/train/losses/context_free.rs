@@ -9,10 +9,7 @@ use crate::model::{
 };
 use crate::train::{
     Task,
-    dataset::{
-        Episode, Sides,
-        window::{Places, TokenRows},
-    },
+    dataset::{Episode, Sides, places::Places, tokens::TokenRows},
     probe::places,
     recipe::losses::Loss,
     ridge::inverse_factor,

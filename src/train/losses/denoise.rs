@@ -15,8 +15,9 @@ use crate::train::{
         HELD_OUT_SEED, Sides, Which,
         beside::Beside,
         hidden::Hide,
+        places::Places,
         returns::Returns,
-        window::{Levels, Places, WindowShape, windows},
+        window::{Levels, WindowShape, windows},
     },
     recipe::{
         losses::{Loss, TrainingLevels},
@@ -123,9 +124,8 @@ pub(super) fn window_shape(task: &Task, batch: usize) -> WindowShape {
     let (plan, units) = (&method.plan, &task.config.units);
     WindowShape {
         batch,
-        horizon: plan.horizon,
         looks: task.looks(),
-        obs_horizon: plan.obs_horizon,
+        plan: plan.clone(),
         table: Table::of(plan, sampler.sub_steps).expect("the recipe was checked: is a bug"),
         levels: match loss.levels {
             TrainingLevels::Schedule => Levels::Schedule,

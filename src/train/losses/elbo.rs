@@ -4,13 +4,15 @@ use super::{Job, Mean, Part};
 use crate::model::{
     Networks,
     latent::elbo::{ElboBatch, ElboOptions},
+    method::Diffused,
     noise::Philox,
 };
 use crate::train::{
     Task,
     dataset::{
         Episode, HELD_OUT_SEED, Sides,
-        window::{BlockShape, Places, blocks},
+        blocks::{BlockShape, blocks},
+        places::Places,
     },
     learner::Scalars,
     recipe::losses::{ElboConfig, Loss},
@@ -18,6 +20,8 @@ use crate::train::{
 use anyhow::{Context, Result};
 use candle_core::Tensor;
 
+/// How often a successor with an action comes without its state, where windows are of actions: both are met, the filter's by states alone.
+const MASKED: f32 = 0.5;
 /// Blocks of what is measured.
 const HELD_OUT_BLOCKS: usize = 256;
 
@@ -49,6 +53,7 @@ impl<'a> ElboLoss<'a> {
             context: (latent.tells > 0).then(|| task.context_units.clone()),
             show_action: config.show_action,
             show_reward: config.show_reward,
+            mask_state: if task.config.method.plan.diffused == Diffused::Action { MASKED } else { 0.0 },
             hide: task.recipe.hide,
         };
         let before = earlier.iter().filter(|stage| stage.weight(Loss::Elbo) > 0.0).map(|stage| stage.steps).sum();

@@ -23,7 +23,8 @@ use crate::train::{
     dataset::{
         HELD_OUT_SEED, Sides,
         hidden::Hide,
-        window::{Places, WindowShape, windows},
+        places::Places,
+        window::{WindowShape, windows},
     },
     recipe::losses::Loss,
 };
@@ -90,7 +91,7 @@ impl<'a> InverseLoss<'a> {
     fn steps(&self) -> usize {
         match self.task.config.method.head {
             Head::Inverse { latent: true, .. } => 1,
-            Head::Inverse { latent: false, .. } | Head::Direct => self.shape.horizon - 1,
+            Head::Inverse { latent: false, .. } | Head::Direct => self.shape.plan.horizon - 1,
         }
     }
 

@@ -2,6 +2,7 @@
 //! weighted sum.
 
 pub mod context_free;
+pub mod critic;
 pub mod denoise;
 pub mod elbo;
 pub mod inverse;
@@ -17,10 +18,11 @@ use super::{
         stages::{Group, Stage},
     },
 };
-use crate::model::{Networks, noise::Philox};
+use crate::model::{Networks, critic::Critic, noise::Philox};
 use anyhow::Result;
 use candle_core::backprop::GradStore;
 use context_free::ContextFreeLoss;
+use critic::CriticLoss;
 use denoise::DenoiseLoss;
 use elbo::ElboLoss;
 use inverse::InverseLoss;
@@ -53,6 +55,7 @@ pub struct Objective<'a> {
     context_free: Option<ContextFreeLoss<'a>>,
     inverse: Option<InverseLoss<'a>>,
     value: Option<ValueLoss<'a>>,
+    critic: Option<CriticLoss<'a>>,
 }
 
 impl<'a> Objective<'a> {
@@ -66,6 +69,7 @@ impl<'a> Objective<'a> {
             context_free: ContextFreeLoss::of_stage(task, stage),
             inverse: InverseLoss::of_stage(task, stage),
             value: ValueLoss::of_stage(task, stage),
+            critic: CriticLoss::of_stage(task, stage),
         }
     }
 
@@ -76,13 +80,15 @@ impl<'a> Objective<'a> {
     pub fn prepared(mut self, networks: &Networks) -> Result<Self> {
         let baseline = networks.latent.as_ref().and_then(|latent| latent.baseline.as_ref());
         let stays = !self.stage.trains.contains_key(&Group::Baseline);
-        let windows = self.denoise.is_some() || self.elbo.is_some() || self.inverse.is_some() || self.value.is_some();
+        let windows =
+            self.denoise.is_some() || self.elbo.is_some() || self.inverse.is_some() || self.value.is_some() || self.critic.is_some();
         let Some(baseline) = baseline.filter(|_| stays && windows) else { return Ok(self) };
         let episodes = surprising(&self.task.split.episodes, baseline, &self.task.room)?;
         self.denoise.iter_mut().for_each(|loss| loss.look_at(&episodes));
         self.elbo.iter_mut().for_each(|loss| loss.look_at(&episodes));
         self.inverse.iter_mut().for_each(|loss| loss.look_at(&episodes));
         self.value.iter_mut().for_each(|loss| loss.look_at(&episodes));
+        self.critic.iter_mut().for_each(|loss| loss.look_at(&episodes));
         Ok(self)
     }
 
@@ -93,7 +99,8 @@ impl<'a> Objective<'a> {
     pub fn step(&self, learner: &mut Learner) -> Result<Scalars> {
         let step = learner.position.step;
         let mut rng = learner.position.stream(self.task.recipe.seed);
-        let jobs = self.jobs(&learner.networks, step, &mut rng)?;
+        let slow = self.critic.as_ref().map(|_| learner.slow_critic(self.task)).transpose()?.flatten();
+        let jobs = self.jobs(&learner.networks, slow.as_ref(), step, &mut rng)?;
         let parts = side_by_side(jobs).into_iter().collect::<Result<Vec<Part>>>()?;
         let mut scalars = means(&parts);
         let grads: Vec<GradStore> = parts.into_iter().map(|part| part.grads).collect();
@@ -108,7 +115,7 @@ impl<'a> Objective<'a> {
     }
 
     /// The work of a step; batches are drawn here, in the order of [`super::recipe::losses::Loss`].
-    fn jobs<'b>(&'b self, networks: &'b Networks, step: usize, rng: &mut Philox) -> Result<Vec<Job<'b>>> {
+    fn jobs<'b>(&'b self, networks: &'b Networks, slow: Option<&'b Critic>, step: usize, rng: &mut Philox) -> Result<Vec<Job<'b>>> {
         let mut jobs = Vec::new();
         if let Some(denoise) = &self.denoise {
             jobs.extend(denoise.jobs(networks, rng)?);
@@ -124,6 +131,9 @@ impl<'a> Objective<'a> {
         }
         if let Some(value) = &self.value {
             jobs.push(value.job(networks, rng)?);
+        }
+        if let (Some(critic), Some(slow)) = (&self.critic, slow) {
+            jobs.push(critic.job(networks, slow, rng)?);
         }
         Ok(jobs)
     }
@@ -150,6 +160,9 @@ impl<'a> Objective<'a> {
         if let Some(value) = &self.value {
             scalars.push(("held_out_value", value.held_out(networks)?));
         }
+        if let Some(critic) = &self.critic {
+            scalars.push(("held_out_critic", critic.held_out(networks)?));
+        }
         Ok(scalars)
     }
 
@@ -169,6 +182,7 @@ impl<'a> Objective<'a> {
             Loss::ContextFree => "held_out_context_free",
             Loss::Inverse => "held_out_inverse",
             Loss::Value => "held_out_value",
+            Loss::Critic => "held_out_critic",
         };
         let weighted = |(loss, weight): (&Loss, &f64)| {
             let found = held_out.iter().find(|(name, _)| *name == of(loss))?;

@@ -14,7 +14,8 @@ use crate::train::{
     dataset::{
         Episode, HELD_OUT_SEED, Sides,
         hidden::Hide,
-        window::{Places, WindowShape, windows},
+        places::Places,
+        window::{WindowShape, windows},
     },
     recipe::losses::Loss,
 };

@@ -10,7 +10,7 @@ use crate::{
     train::{
         dataset::{
             Episode,
-            window::{TokenRows, histories},
+            tokens::{TokenRows, histories},
         },
         ridge::Table,
     },

@@ -27,6 +27,8 @@ pub enum Loss {
     Inverse,
     /// [`ValueConfig`].
     Value,
+    /// [`CriticConfig`].
+    Critic,
 }
 
 impl Loss {
@@ -38,6 +40,7 @@ impl Loss {
             Self::ContextFree => "context_free",
             Self::Inverse => "inverse",
             Self::Value => "value",
+            Self::Critic => "critic",
         }
     }
 }
@@ -56,6 +59,19 @@ pub struct Losses {
     pub inverse: Option<InverseConfig>,
     /// What windows are worth; absent for models without a value network.
     pub value: Option<ValueConfig>,
+    /// What actions are worth; absent for models without critics.
+    pub critic: Option<CriticConfig>,
+}
+
+/// Errors of implicit Q-learning on transitions ([`crate::model::method::Guide::Critic`]). The slow copy that they are drawn to is the average of the
+/// stage, whose `ema_decay_max` is 1 less the rate of other programs (their .005 is .995 here).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CriticConfig {
+    /// Transitions in a batch.
+    pub batch: usize,
+    /// Which expectile of what the data's actions are worth a state is worth; 0.5 is their mean.
+    pub expectile: f64,
 }
 
 /// Squared errors of the actions of real steps ([`crate::model::method::Head::Inverse`]).
@@ -238,6 +254,7 @@ fn check_heads(recipe: &Recipe) -> Result<(), RecipeError> {
     for (loss, there, asked, network) in [
         (Loss::Inverse, recipe.losses.inverse.is_some(), model.head.is_inverse(), "model.head of kind inverse"),
         (Loss::Value, recipe.losses.value.is_some(), model.has_value(), "model.guide of kind value"),
+        (Loss::Critic, recipe.losses.critic.is_some(), model.has_critic(), "model.guide of kind critic"),
     ] {
         let key = format!("losses.{}", loss.name());
         require(there || !asked, &key, format!("is missing, but {network} asks for it"))?;
@@ -250,6 +267,15 @@ fn check_heads(recipe: &Recipe) -> Result<(), RecipeError> {
     if let Some(value) = &recipe.losses.value {
         between("losses.value.batch", value.batch, 1..=BATCH_MAX)?;
         between("losses.value.clean_fraction", value.clean_fraction, 0.0..=1.0)?;
+    }
+    if let Some(critic) = &recipe.losses.critic {
+        between("losses.critic.batch", critic.batch, 1..=BATCH_MAX)?;
+        let inside = critic.expectile > 0.0 && critic.expectile < 1.0;
+        require(inside, "losses.critic.expectile", format!("is {}, must lie between 0 and 1", critic.expectile))?;
+        let mut stages = recipe.stages.iter().filter(|stage| stage.weight(Loss::Critic) > 0.0);
+        let swift = stages.find(|stage| stage.ema_decay_max.is_none());
+        let key = swift.map_or(String::new(), |stage| format!("stages.{}.ema_decay_max", stage.name));
+        require(swift.is_none(), key, "is missing: the average of the stage is the slow copy that critics are drawn to")?;
     }
     between("losses.denoise.told_hidden", recipe.losses.denoise.told_hidden, 0.0..=1.0)
 }

@@ -11,7 +11,7 @@ use crate::model::{
     checkpoint::{NAME_LEN_MAX, is_name},
     config::{Defaults, ModelConfig, Restart, Trained, Units},
     diffusion::refine::LatentRouting,
-    method::{LatentSource, Method, Schedule, Told},
+    method::{Diffused, LatentSource, Method, Schedule, Told},
     normalizer::Affine,
     options::SamplerOptions,
     trajectory::Layout,
@@ -202,7 +202,9 @@ impl Recipe {
         let room = NAME_LEN_MAX.saturating_sub(format!("-seed{}", self.seed).len());
         let named = is_name(&self.name) && self.name.len() <= room;
         require(named, "name", format!("{:?} must be 1 to {room} of A-Z a-z 0-9 _ . -, as the server serves it by this name", self.name))?;
-        require(self.model.plan.horizon >= 2, "model.plan.horizon", "must be at least 2")?;
+        let least = if self.model.plan.diffused == Diffused::Action { 1 } else { 2 };
+        let reason = format!("must be at least {least}: a plan that ends where it begins says nothing");
+        require(self.model.plan.horizon >= least, "model.plan.horizon", reason)?;
         for (key, value) in [("checkpoint_every", self.checkpoint_every), ("log_every", self.log_every)] {
             require(value >= 1, key, "must be at least 1")?;
         }

@@ -23,11 +23,13 @@ pub enum Group {
     Inverse,
     /// What judges windows.
     Guide,
+    /// What judges actions.
+    Critic,
 }
 
 impl Group {
     /// All of them.
-    pub const ALL: [Self; 5] = [Self::Baseline, Self::Latent, Self::Denoiser, Self::Inverse, Self::Guide];
+    pub const ALL: [Self; 6] = [Self::Baseline, Self::Latent, Self::Denoiser, Self::Inverse, Self::Guide, Self::Critic];
 
     /// As recipes spell it.
     pub fn name(self) -> &'static str {
@@ -37,6 +39,7 @@ impl Group {
             Self::Denoiser => "denoiser",
             Self::Inverse => "inverse",
             Self::Guide => "guide",
+            Self::Critic => "critic",
         }
     }
 
@@ -48,6 +51,7 @@ impl Group {
             Self::Denoiser => "denoiser.",
             Self::Inverse => "inverse.",
             Self::Guide => "guide.",
+            Self::Critic => "critic.",
         }
     }
 
@@ -65,6 +69,7 @@ impl Group {
             Self::Denoiser => loss == Loss::Denoise,
             Self::Inverse => loss == Loss::Inverse,
             Self::Guide => loss == Loss::Value,
+            Self::Critic => loss == Loss::Critic,
         }
     }
 }
@@ -86,7 +91,7 @@ pub struct Stage {
     pub freezes: BTreeMap<Group, f64>,
     /// As a function of the step of this stage.
     pub learning_rate: LearningRate,
-    /// Decoupled weight decay.
+    /// Decoupled weight decay, of matrices and kernels.
     pub weight_decay: f64,
     /// Largest decay of the average of the weights, which is what a checkpoint holds; absent: no average.
     pub ema_decay_max: Option<f64>,
@@ -152,6 +157,7 @@ impl Stage {
                 Loss::ContextFree => recipe.losses.context_free.is_some(),
                 Loss::Inverse => recipe.losses.inverse.is_some(),
                 Loss::Value => recipe.losses.value.is_some(),
+                Loss::Critic => recipe.losses.critic.is_some(),
             };
             require(*weight == 0.0 || there, key(&format!("minimizes.{}", loss.name())), format!("needs [losses.{}]", loss.name()))?;
         }
@@ -164,6 +170,7 @@ impl Stage {
                 Group::Baseline => require(recipe.model.latent.baseline().is_some(), &key, "needs model.latent.baseline")?,
                 Group::Inverse => require(recipe.losses.inverse.is_some(), &key, "needs model.head of kind inverse")?,
                 Group::Guide => require(recipe.losses.value.is_some(), &key, "needs model.guide of kind value")?,
+                Group::Critic => require(recipe.losses.critic.is_some(), &key, "needs model.guide of kind critic")?,
             }
             let reached = self.minimizes.iter().any(|(loss, weight)| *weight > 0.0 && group.is_reached_by(*loss));
             require(reached, &key, "is not reached by any loss that this stage minimizes")?;
@@ -231,7 +238,10 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
     let learns = |group: Group| recipe.stages.iter().any(|stage| stage.trains.get(&group).is_some_and(|factor| *factor > 0.0));
     require(learns(Group::Denoiser), "stages", "train no denoiser, and a checkpoint of random weights would be shipped")?;
     require(recipe.model.latent.gru().is_none() || learns(Group::Latent), "stages", "train no latent, but model.latent asks for it")?;
-    for (group, asked) in [(Group::Inverse, recipe.model.head.is_inverse()), (Group::Guide, recipe.model.has_value())] {
+    let model = &recipe.model;
+    for (group, asked) in
+        [(Group::Inverse, model.head.is_inverse()), (Group::Guide, model.has_value()), (Group::Critic, model.has_critic())]
+    {
         require(
             !asked || learns(group),
             "stages",

@@ -79,8 +79,11 @@ def _value(text: str) -> Any:
         return text
 
 
-def run_command(program: str, run: Callable[[], object], *, status: int = 1) -> int:
-    """Runs the body of a command: 0; `status` with one sentence on stderr for what the user can mend; 130 when interrupted."""
+def run_command(program: str, run: Callable[[], object], *, status: int = 1, extra: str = "mujoco") -> int:
+    """Runs the body of a command: 0; `status` with one sentence on stderr for what the user can mend; 130 when interrupted.
+
+    `extra` is the one of this package's that has what the command imports.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that cannot spell the results still gets them
@@ -94,7 +97,7 @@ def run_command(program: str, run: Callable[[], object], *, status: int = 1) -> 
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return status
     except (AdaError, ValueError, OSError, ImportError) as error:
-        print(f"{program}: {_sentence(error)}", file=sys.stderr)
+        print(f"{program}: {_sentence(error, extra)}", file=sys.stderr)
         return status
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
@@ -119,8 +122,8 @@ def check_environment(arguments: argparse.Namespace) -> None:
     import_environments().make(arguments.env, episode_steps=arguments.episode_steps, **options).close()
 
 
-def _sentence(error: Exception) -> str:
+def _sentence(error: Exception, extra: str) -> str:
     """What the user should read of an error, on one line."""
     if isinstance(error, ImportError):
-        return f"{error}; install with: pip install 'ada-diffuser[mujoco]'"
+        return f"{error}; install with: pip install 'ada-diffuser[{extra}]'"
     return " ".join(str(error).split())

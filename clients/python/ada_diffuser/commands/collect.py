@@ -7,6 +7,7 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -17,7 +18,7 @@ from ada_diffuser.commands.progress import progress
 if TYPE_CHECKING:
     from ada_diffuser.collect import Job
     from ada_diffuser.dataset import Episodes
-    from ada_diffuser.experts import Expert, ExpertRecipe, PolicyBank
+    from ada_diffuser.experts import Expert, ExpertRecipe, Flight, PolicyBank
 
 _ABOUT = """\
 Let an expert that sees the hidden context fly an environment, and write the episodes as a D4RL-layout HDF5 file:
@@ -25,12 +26,12 @@ observations, actions (as executed), rewards, terminals, timeouts, infos/context
 Beside it goes X.card.json: environment, options, seed, returns, expert, SHA-256, the command. infos/context is written where
 `info["context"]` tells it.
 
-An environment's class says what its expert is. A formula (its method `expert_action`) flies at once. Where there is none, policies
-are searched for here (Augmented Random Search, linear policies; for the cheetah one to two minutes for each search, two at a
-time) and kept beside the data as X.expert.npz; a later call with the same environment, options, and expert settings uses that
-file again. An environment that says nothing of it needs --expert: a function of yours that takes the observation and the
-context, which is None unless the environment has an attribute `context`, or random actions. The same arguments give the same
-bytes.
+An environment's class says what its expert is. A formula (its method `expert_action`) or a plan (`expert_plan`) flies at once. Where
+there is none, policies are searched for here (Augmented Random Search, linear policies; for the cheetah one to two minutes for each
+search, two at a time) and kept beside the data as X.expert.npz; a later call with the same environment, options, and expert settings
+uses that file again. An environment that says nothing of it needs --expert: a function of yours that takes the observation and the
+context (the attribute `context` of the environment; else its `goal`, which goes to infos/goal; else None), or random actions. The
+same arguments give the same bytes.
 
 --blind S has a share S of the episodes, drawn by the seed, flown by an expert that does not see the context: policies searched
 for without it and kept as X.blind.npz, or the formula with the context's mean, where the class says what that is (`mean_context`).
@@ -39,6 +40,11 @@ infos/blind tells those episodes, the card has the returns of both kinds.
 --play S has a share S of the episodes flown by the expert while it is told the context of another world, drawn as the true one is. Its
 actions then say nothing of the true context, so that what comes of them does: data to find what is hidden in, and nothing to
 imitate. infos/play tells those episodes; ada-trainer has no planner imitate them.
+
+--quality takes the data of a learner in the place of an expert's, where the class keeps the search (walker2d does): medium is the policy
+that earned about a third of what the best one does, medium-replay all that the search tried up to there, each policy in its own
+episode (or --episodes of them), medium-expert half medium, half the best. They are snapshots of one run, that of X.expert.npz: give the
+three data sets the same one with --expert.
 
 --also FILE puts the episodes of another data set behind these, as play: a latent is then found in both, and the planner imitates these
 alone. Data of other phases, gains and tasks, pooled for the latent and then narrowed to the target, is what meta-learning means here.
@@ -61,6 +67,9 @@ examples:
   ada-collect --env cheetah-wind-e --session-episodes 10 --play 0.5 --episodes 600 --out data/sessions.h5
   ada-collect --env cheetah-wind-s --option gain=2 --episodes 150 --out data/strong-wind.h5
   ada-collect --env cheetah-wind-s --also data/strong-wind.h5 --episodes 300 --out data/pooled.h5
+  ada-collect --env maze2d-umaze --option reset_target=true --episodes 500 --out data/maze2d-umaze.h5
+  ada-collect --env walker2d --quality medium --episodes 300 --out data/walker2d-medium.h5
+  ada-collect --env walker2d --quality medium-replay --expert data/walker2d-medium.expert.npz --out data/walker2d-medium-replay.h5
   ada-collect --env my_module:Mine-v0 --expert my_module:policy --out data/mine.h5
 """
 
@@ -93,9 +102,10 @@ def _run(args: argparse.Namespace, command: str) -> None:
     others = _others(args.also)
     expert = _expert(args, job, blind=False)
     blind = _expert(args, job, blind=True) if job.blind else None
+    job, flown, quality = _flights(args, job, expert)
     with progress(job.episodes, "episodes", "episode", quiet=args.quiet) as advance:
-        episodes, failed = collect(job, expert, advance, blind=blind)
-    card = data_card(job, expert, episodes, failed, blind)
+        episodes, failed = collect(job, expert, advance, blind=blind, flights=flown)
+    card = data_card(job, expert, episodes, failed, blind, quality)
     if others:
         episodes = with_play(episodes, list(others.values()))
         card["also"] = {name: {"episodes": len(other.returns()), "steps": len(other.rewards)} for name, other in others.items()}
@@ -124,6 +134,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     expert = parser.add_argument_group("expert")
     expert.add_argument("--expert", metavar="E", help="fly this one: X.npz, MODULE:FUNCTION (of observation and context), or random")
+    expert.add_argument(
+        "--quality",
+        metavar="Q",
+        help="of a searched expert's way there: medium, medium-replay or medium-expert (default: the expert's best alone)",
+    )
     expert.add_argument(
         "--blind", type=float, default=0.0, metavar="SHARE", help="share of the episodes flown without sight of the context (default 0)"
     )
@@ -164,6 +179,13 @@ def _check_arguments(args: argparse.Namespace) -> None:
         raise ValueError(f"--play must be a share below 1, not {args.play:g}: a planner needs something to imitate")
     if args.blind + args.play > 1.0:
         raise ValueError(f"--blind {args.blind:g} and --play {args.play:g} are more than all episodes")
+    if args.quality:
+        from ada_diffuser.experts import QUALITIES
+
+        if args.quality not in QUALITIES:
+            raise ValueError(f"--quality must be one of {', '.join(QUALITIES)}, not {args.quality!r}")
+        if args.blind or args.play:
+            raise ValueError("--quality is of what a learner saw, and takes neither --blind nor --play")
     if args.blind_expert and not args.blind:
         raise ValueError("--blind-expert flies no episode without --blind")
     check_output("--out", args.out, ".h5", ".hdf5")
@@ -194,6 +216,19 @@ def _others(paths: Sequence[Path]) -> dict[str, Episodes]:
         except (OSError, KeyError) as error:
             raise ValueError(f"--also {path}: is no data set of ada-collect: {error}") from None
     return found
+
+
+def _flights(args: argparse.Namespace, job: Job, expert: Expert) -> tuple[Job, Sequence[Flight] | None, dict[str, Any] | None]:
+    """The job, who flies each of its episodes where a quality is wanted, and what the card says of it."""
+    if not args.quality:
+        return job, None, None
+    from ada_diffuser.experts import ExpertRecipe, PolicyBank, flights
+
+    if not isinstance(expert, PolicyBank):
+        raise ValueError("--quality needs an expert that was searched for, and this one is a function")
+    flown, quality = flights(expert, ExpertRecipe.from_json(expert.card["recipe"]), args.quality, job.episodes, job.seed)
+    noise = job.noise if all(flight.noise is None for flight in flown) else (0.0,)
+    return replace(job, episodes=len(flown), noise=noise), flown, quality
 
 
 def _noise(text: str) -> tuple[float, ...]:

@@ -1,11 +1,11 @@
-"""Environments with a hidden context; importing this module registers them with Gymnasium.
+"""Environments, most of them with a hidden context; importing this module registers them with Gymnasium.
 
     import gymnasium
     env = gymnasium.make("ada_diffuser.environments:ada/PointWind-S-v0")
 
 `-S` contexts change within an episode, `-E` contexts between episodes, but for those of the paper's Dir-E, which change within. The
 context is in `info["context"]` alone: the array returned by step `t` acted while `a_t` was executed, the one returned by `reset` acts on
-the first step.
+the first step. Those that hide nothing, Walker2d, Maze2D and Kitchen, tell none.
 """
 
 from __future__ import annotations
@@ -14,17 +14,22 @@ import importlib
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import load_env_creator
 
 from .cheetah import CheetahVelE, CheetahWindE, CheetahWindS
 from .cheetah_switching import CheetahCumulativeS, CheetahDelayedS, CheetahGaleS
+from .kitchen import KitchenMixed, KitchenPartial
 from .legged import HopperGravityE, WalkerMassE
+from .maze import Maze2dLarge, Maze2dMedium, Maze2dUmaze
 from .pendulum import PendulumGravityE
 from .pendulum_torque import PendulumTorqueS
 from .point_wind import PointWindS
 from .search import ArsSettings, Search
-from .task import NAMES, HiddenTask
+from .task import NAMES, HiddenTask, References, Task
 from .turning import AntDirE, CheetahDirE
+from .walker import Walker2d
 
 __all__ = [
     "NAMES",
@@ -39,14 +44,25 @@ __all__ = [
     "CheetahWindS",
     "HiddenTask",
     "HopperGravityE",
+    "KitchenMixed",
+    "KitchenPartial",
+    "Maze2dLarge",
+    "Maze2dMedium",
+    "Maze2dUmaze",
     "PendulumGravityE",
     "PendulumTorqueS",
     "PointWindS",
+    "References",
     "Search",
+    "Task",
+    "Walker2d",
     "WalkerMassE",
     "action_noise",
     "failed",
+    "goal",
+    "hidden",
     "make",
+    "measures",
     "steps_max",
 ]
 
@@ -76,6 +92,11 @@ def make(name: str, *, episode_steps: int | None = None, **options: Any) -> gym.
     return env
 
 
+def hidden() -> list[str]:
+    """Short names of the environments that hide a context."""
+    return [name for name, env_id in NAMES.items() if issubclass(load_env_creator(gym.spec(env_id).entry_point), HiddenTask)]
+
+
 def steps_max(env: gym.Env) -> int:
     """Steps after which an episode of an environment from `make` is truncated."""
     steps = env.spec and env.spec.max_episode_steps
@@ -88,6 +109,17 @@ def failed(env: gym.Env, episode_return: float) -> bool:
     """Whether the environment calls a finished episode failed; one that has no opinion never does."""
     opinion = getattr(env.unwrapped, "failed", None)
     return bool(callable(opinion) and opinion(episode_return))
+
+
+def measures(env: gym.Env, episode_return: float) -> dict[str, float]:
+    """What the environment says of a finished episode beside its return, by name; nothing where it has no words for it."""
+    says = getattr(env.unwrapped, "measures", None)
+    return says(episode_return) if callable(says) else {}
+
+
+def goal(env: gym.Env) -> np.ndarray | None:
+    """What the running episode wants, where the environment has goals: see `Task.goal`."""
+    return getattr(env.unwrapped, "goal", None) if getattr(env.unwrapped, "goal_columns", ()) else None
 
 
 def action_noise(env: gym.Env) -> tuple[float, ...]:

@@ -36,6 +36,7 @@ class Search:
             for with that one alone. Empty where one policy reads the context.
         varies: option that is also an attribute -> share by which an episode of practice changes it at most, up or down.
         practice: attribute -> its value in practice, where that is another than the one the policies are judged by.
+        keeps_run: whether an expert of one policy keeps all of its search, for data of a learner (`ada-collect --quality`).
     """
 
     searches: int = 3
@@ -43,3 +44,4 @@ class Search:
     holds: str = ""
     varies: Mapping[str, float] = field(default_factory=dict)
     practice: Mapping[str, float] = field(default_factory=dict)
+    keeps_run: bool = False

@@ -5,20 +5,26 @@ from .policy import (
     CalledExpert,
     Expert,
     LinearPolicy,
+    PlannedExpert,
     PolicyBank,
     import_expert,
     load_expert,
     random_expert,
     save_expert,
 )
+from .snapshots import QUALITIES, Flight, flights
 from .training import ExpertRecipe, formula_of, make_expert, recipe_for
 
 __all__ = [
+    "QUALITIES",
     "CalledExpert",
     "Expert",
     "ExpertRecipe",
+    "Flight",
     "LinearPolicy",
+    "PlannedExpert",
     "PolicyBank",
+    "flights",
     "formula_of",
     "import_expert",
     "kept_expert",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,6 +41,18 @@ Rollout = Callable[[LinearPolicy, int], tuple[float, np.ndarray]]
 """(policy, episode seed) -> (return, states visited (steps, features))."""
 
 
+def perturbations(shape: tuple[int, int], settings: ArsSettings, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """What each iteration tries: perturbations (directions, *shape) and an episode seed for each (directions,)."""
+    for _ in range(settings.iterations):
+        yield rng.standard_normal((settings.directions, *shape)), rng.integers(2**31, size=settings.directions)
+
+
+def both_ways(policy: LinearPolicy, delta: np.ndarray, settings: ArsSettings) -> tuple[LinearPolicy, LinearPolicy]:
+    """The policy moved along a perturbation (actions, features), and against it."""
+    step = settings.noise * delta
+    return replace(policy, weights=policy.weights + step), replace(policy, weights=policy.weights - step)
+
+
 def search(rollout: Rollout, shape: tuple[int, int], settings: ArsSettings, rng: np.random.Generator) -> Iterator[LinearPolicy]:
     """Yield the policy after each iteration.
 
@@ -51,19 +64,22 @@ def search(rollout: Rollout, shape: tuple[int, int], settings: ArsSettings, rng:
         settings: the constants.
         rng: all randomness of the search.
     """
-    weights, moments = np.zeros(shape), RunningMoments(shape[1])
-    for _ in range(settings.iterations):
-        deltas = rng.standard_normal((settings.directions, *shape))
-        seeds = rng.integers(2**31, size=settings.directions)
+    policy, moments = start(shape), RunningMoments(shape[1])
+    for deltas, seeds in perturbations(shape, settings, rng):
         returns, visited = np.empty((settings.directions, 2)), []
         for i, (delta, seed) in enumerate(zip(deltas, seeds, strict=True)):
-            for j, sign in enumerate((1.0, -1.0)):
-                policy = LinearPolicy(weights + sign * settings.noise * delta, moments.mean, moments.std)
-                returns[i, j], states = rollout(policy, int(seed))
+            for j, moved in enumerate(both_ways(policy, delta, settings)):
+                returns[i, j], states = rollout(moved, int(seed))
                 visited.append(states)
-        weights = weights + ascent(deltas, returns, settings)
+        weights = policy.weights + ascent(deltas, returns, settings)
         moments.add(np.concatenate(visited))
-        yield LinearPolicy(weights, moments.mean, moments.std)
+        policy = LinearPolicy(weights, moments.mean, moments.std)
+        yield policy
+
+
+def start(shape: tuple[int, int]) -> LinearPolicy:
+    """What a search begins with: it does nothing."""
+    return LinearPolicy(np.zeros(shape), np.zeros(shape[1]), np.ones(shape[1]))
 
 
 def ascent(deltas: np.ndarray, returns: np.ndarray, settings: ArsSettings) -> np.ndarray:

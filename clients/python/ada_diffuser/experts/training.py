@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import multiprocessing
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -17,7 +17,7 @@ from .. import environments
 from ..environments import ArsSettings, Search
 from ..leash import end_with
 from .ars import search
-from .policy import CalledExpert, LinearPolicy, PolicyBank
+from .policy import CalledExpert, LinearPolicy, PlannedExpert, PolicyBank
 
 PROCESSES_MAX = 2
 POLL_S = 0.5
@@ -55,6 +55,12 @@ class ExpertRecipe:
         """Of all searches together."""
         return max(1, len(self.targets)) * self.seeds * self.ars.iterations
 
+    @classmethod
+    def from_json(cls, plain: Mapping[str, Any]) -> ExpertRecipe:
+        """From what `to_json` made."""
+        tuples = {name: tuple(plain[name]) for name in ("targets", "judge_noise")}
+        return cls(**{**plain, **tuples, "ars": ArsSettings(**plain["ars"])})
+
     def to_json(self) -> dict[str, Any]:
         """The recipe as plain JSON values."""
         plain = {**asdict(self), "targets": list(self.targets), "judge_noise": list(self.judge_noise)}
@@ -63,21 +69,31 @@ class ExpertRecipe:
         return plain
 
 
-def formula_of(env: gym.Env, *, blind: bool = False) -> CalledExpert | None:
+def formula_of(env: gym.Env, *, blind: bool = False) -> CalledExpert | PlannedExpert | None:
     """The expert that the environment's class has as a method, with the options of `env`; None where there is none.
 
-    A blind one is told the environment's `mean_context`, whatever the context is. Raises `ValueError` where it has none.
+    It is the formula `expert_action`, or the plan `expert_plan`, which is made anew for each episode. A blind one is told the environment's
+    `mean_context`, whatever the context is. Raises `ValueError` where it has none.
     """
-    act = getattr(env.unwrapped, "expert_action", None)
+    act, plan = (getattr(env.unwrapped, name, None) for name in ("expert_action", "expert_plan"))
+    if callable(plan):
+        if blind:
+            raise ValueError(f"{env.spec.id} has an expert that plans, and none that is blind")
+        return PlannedExpert(plan, {"kind": "planned", "law": _first_line(plan)})
     if not callable(act):
         return None
-    card = {"kind": "analytic", "law": inspect.cleandoc(act.__doc__ or "").partition("\n")[0]}
+    card = {"kind": "analytic", "law": _first_line(act)}
     if not blind:
         return CalledExpert(act, card)
     mean = getattr(env.unwrapped, "mean_context", None)
     if mean is None:
         raise ValueError(f"{env.spec.id} has no mean_context, which its formula could take for the one that a blind expert does not see")
     return CalledExpert(lambda observation, context: act(observation, mean), {**card, "told": mean.tolist()})
+
+
+def _first_line(method: Callable[..., Any]) -> str:
+    """Of its docstring."""
+    return inspect.cleandoc(method.__doc__ or "").partition("\n")[0]
 
 
 def recipe_for(
@@ -118,13 +134,17 @@ def make_expert(recipe: ExpertRecipe, progress: Callable[[int], object] = lambda
     card = {
         "kind": "ars",
         "recipe": recipe.to_json(),
-        "policies": [record for _, record in best],
-        "searches": [record for slot in slots for _, record in slot],
+        "policies": [record for _, record, _ in best],
+        "searches": [record for slot in slots for _, record, _ in slot],
     }
-    return PolicyBank([policy for policy, _ in best], targets, card)
+    return PolicyBank([policy for policy, *_ in best], targets, card, best[0][2])
 
 
-def _run_searches(recipe: ExpertRecipe, progress: Callable[[int], object]) -> list[tuple[LinearPolicy, dict[str, Any]]]:
+Found = tuple[LinearPolicy, dict[str, Any], list[LinearPolicy] | None]
+"""What a search brings: its best policy, what the card says of it, and the policy after each iteration where that is kept."""
+
+
+def _run_searches(recipe: ExpertRecipe, progress: Callable[[int], object]) -> list[Found]:
     """All searches in order: those of the first policy, then those of the next."""
     jobs = [(recipe, slot, number) for slot in range(max(1, len(recipe.targets))) for number in range(recipe.seeds)]
     # Spawned, not forked: a fork would copy whatever threads the caller's libraries run.
@@ -168,9 +188,10 @@ class _Course:
         self.env, self.steps = env.unwrapped, environments.steps_max(env)
         self.varied = {name: (getattr(self.env, name), share) for name, share in how.varies.items()}
         self.practice = {name: (getattr(self.env, name), value) for name, value in how.practice.items()}
-        self.sees_context = not (recipe.targets or recipe.blind)
         self.env.reset(seed=0)  # what a class draws there need not be there earlier
-        context_size = len(self.env.context) if self.sees_context else 0
+        context = getattr(self.env, "context", None)
+        self.sees_context = context is not None and not (recipe.targets or recipe.blind)
+        context_size = len(context) if self.sees_context else 0
         self.shape = (self.env.action_space.shape[0], self.env.observation_space.shape[0] + context_size)
 
     def practise(self, policy: LinearPolicy, seed: int) -> tuple[float, np.ndarray]:
@@ -220,18 +241,27 @@ class _Course:
         return total, np.array(visited, np.float64)
 
 
-def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> tuple[LinearPolicy, dict[str, Any]]:
+def search_rngs(seed: int, slot: int, number: int) -> list[np.random.Generator]:
+    """Of one search: what draws its perturbations, the episodes that its iterates are judged by, and the fresh ones."""
+    return [np.random.default_rng([seed, slot, number, part]) for part in range(3)]
+
+
+def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> Found:
     """One search: the best iterate on evaluation episodes, and what it reaches on fresh ones."""
     course = _Course(recipe, slot)
-    search_rng, judge_rng, fresh_rng = (np.random.default_rng([recipe.seed, slot, number, part]) for part in range(3))
+    search_rng, judge_rng, fresh_rng = search_rngs(recipe.seed, slot, number)
     judge_seeds = judge_rng.integers(2**31, size=JUDGE_EPISODES)
     best, best_score, best_iteration = None, -np.inf, 0
+    run: list[LinearPolicy] = []
+    judged: list[tuple[int, float]] = []
     for iteration, policy in enumerate(search(course.practise, course.shape, recipe.ars, search_rng), start=1):
         with _iterations_done.get_lock():
             _iterations_done.value += 1
+        run.append(policy)
         if iteration % JUDGE_EVERY and iteration != recipe.ars.iterations:
             continue
         score = float(course.judge(policy, judge_seeds, recipe.judge_noise)[0].mean())
+        judged.append((iteration, round(score, 3)))
         if score > best_score:
             best, best_score, best_iteration = policy, score, iteration
     if best is None:
@@ -245,4 +275,6 @@ def _search_job(recipe: ExpertRecipe, slot: int, number: int) -> tuple[LinearPol
         "fresh": course.summary(best, fresh_seeds, recipe.judge_noise),
         "fresh_without_noise": course.summary(best, fresh_seeds, (0.0,)),
     }
-    return best, record
+    if not course.env.search.keeps_run or recipe.targets:
+        return best, record, None
+    return best, record | {"run": judged}, run

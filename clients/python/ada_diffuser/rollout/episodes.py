@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import replace
+from types import TracebackType
 from typing import Any
 
 import gymnasium
@@ -12,9 +14,10 @@ import numpy as np
 
 from ada_diffuser import environments
 from ada_diffuser.broker import ChunkBroker
-from ada_diffuser.client import Client
+from ada_diffuser.client import Client, Session
 from ada_diffuser.errors import AdaError
-from ada_diffuser.messages import Chunk, Model, Observation
+from ada_diffuser.messages import Chunk, Model, Observation, SamplerOptions
+from ada_diffuser.rollout.goal import wanted_columns, with_goal
 from ada_diffuser.rollout.oracle import true_context
 from ada_diffuser.rollout.result import ActLog, Episode, Evaluation, Trial
 
@@ -26,13 +29,14 @@ def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: No
     """Runs the trial's sessions, `trial.vector` of them side by side.
 
     Rewards are reported with the actions, since a latent may live off them, unless the trial withholds them. An oracle is told the true
-    context. Raises the `AdaError` of the first act that cannot be had, and ValueError where environment and model do not fit.
+    context, and a model that takes goals that of each episode. Raises the `AdaError` of the first act that cannot be had, and ValueError
+    where environment and model do not fit.
     """
     started = time.monotonic()
     acts, episodes = ActLog(), []
     with ExitStack() as stack:
         lanes = _open_lanes(client, trial, stack)
-        session = lanes[0].broker.session
+        model, options = lanes[0].broker.session.model, lanes[0].options
         for first in range(0, len(trial.sessions), len(lanes)):
             sessions = trial.sessions[first : first + len(lanes)]
             group = lanes[: len(sessions)]
@@ -40,14 +44,18 @@ def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: No
                 lane.start(seed, length)
             _run(client, trial, group, acts, progress)
             episodes += [episode for lane in group for episode in lane.episodes]
-    return Evaluation(trial, session.model, session.options, episodes, acts, time.monotonic() - started)
+    return Evaluation(trial, model, options, episodes, acts, time.monotonic() - started)
 
 
 class _Lane:
-    """One environment and its session on the server."""
+    """One environment and its session on the server; an episode whose goal is told has a session of its own."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], broker: ChunkBroker, trial: Trial) -> None:
-        self.env, self.broker, self._trial = env, broker, trial
+    def __init__(self, client: Client, trial: Trial, env: gymnasium.Env[Any, Any], seed: int) -> None:
+        self.env, self._client, self._trial = env, client, trial
+        self._goal_columns = wanted_columns(client, trial, env)
+        if self._goal_columns:
+            env.reset(seed=seed)
+        self.broker = ChunkBroker(self._open(seed))
         #: Whether the last of `_length` episodes is over.
         self.done = True
         self.episodes: list[Episode] = []
@@ -55,6 +63,22 @@ class _Lane:
         self.state = np.zeros(0, np.float32)
         #: What the environment said last.
         self._facts: dict[str, Any] = {}
+
+    def _open(self, seed: int) -> Session:
+        options = with_goal(self._trial.options, self.env, self._goal_columns)
+        return self._client.open_session(self._trial.model, seed=seed, options=options)
+
+    def __enter__(self) -> _Lane:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.broker.session.__exit__(kind, error, trace)
+
+    @property
+    def options(self) -> SamplerOptions:
+        """In force in all episodes: without the goal that each of them has."""
+        options = self.broker.session.options
+        return replace(options, told_goal=None) if self._goal_columns else options
 
     @property
     def episode(self) -> Episode:
@@ -70,9 +94,13 @@ class _Lane:
         """The next episode of the session with this seed: the environment goes on drawing where it was, and the model looks back."""
         index = len(self.episodes)
         observation, self._facts = self.env.reset(seed=None if index else seed)
-        self.broker.reset(_model_seed(seed, index), keep_history=index > 0 and not self._trial.forget)
+        if self._goal_columns:
+            self.broker.session.close()
+            self.broker = ChunkBroker(self._open(_model_seed(seed, index)))
+        else:
+            self.broker.reset(_model_seed(seed, index), keep_history=index > 0 and not self._trial.forget)
         self.state = np.asarray(observation, np.float32)
-        self.episodes.append(Episode(seed, index=index))
+        self.episodes.append(Episode(seed, index=index, goal=environments.goal(self.env)))
 
     def observation(self) -> Observation:
         """What the act that is due has to tell."""
@@ -84,7 +112,7 @@ class _Lane:
         self.broker.accept(chunk)
         self.episode.act_steps.append(len(self.episode.rewards))
         self.episode.latents.append(chunk.latent_mean)
-        if chunk.planned_states is not None:
+        if chunk.planned_states is not None and len(chunk.planned_states):
             self.episode.plans.append(chunk.planned_states)
 
     def step(self) -> None:
@@ -100,6 +128,7 @@ class _Lane:
         self.state = np.asarray(observation, np.float32)
         if terminated or truncated:
             self.episode.failed = environments.failed(self.env, self.episode.total)
+            self.episode.measures = environments.measures(self.env, self.episode.total)
             self.done = len(self.episodes) == self._length
             if not self.done:
                 self._begin(self.episode.seed)
@@ -115,9 +144,9 @@ def _open_lanes(client: Client, trial: Trial, stack: ExitStack) -> list[_Lane]:
     for seed, _ in trial.sessions[: trial.vector]:
         env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
         stack.callback(env.close)
-        session = stack.enter_context(client.open_session(trial.model, seed=seed, options=trial.options))
-        _check_fit(trial.env, env, session.model)
-        lanes.append(_Lane(env, ChunkBroker(session), trial))
+        lane = stack.enter_context(_Lane(client, trial, env, seed))
+        _check_fit(trial.env, env, lane.broker.session.model)
+        lanes.append(lane)
     return lanes
 
 
@@ -127,7 +156,8 @@ def check(client: Client, trial: Trial) -> int:
     Returns the steps of an episode at most.
     """
     env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
-    with closing(env), client.open_session(trial.model, seed=trial.seed, options=trial.options) as session:
+    with closing(env), _Lane(client, trial, env, trial.seed) as lane:
+        session = lane.broker.session
         _check_fit(trial.env, env, session.model)
         true_context(env, env.reset(seed=trial.seed)[1] if session.model.context else {}, session.model, session.options)
         if trial.session_episodes > 1 and not trial.forget:

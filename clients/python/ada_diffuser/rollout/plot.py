@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ada_diffuser import environments
 from ada_diffuser.rollout.clusters import Clusters
 from ada_diffuser.rollout.readout import Reading, Readout
 from ada_diffuser.rollout.result import Episode, Evaluation
@@ -16,6 +18,8 @@ from ada_diffuser.rollout.result import Episode, Evaluation
 #: Shown episodes stand side by side, at most so many, and so many steps of each: a wind may turn every dozen steps.
 EPISODES_SHOWN = 3
 STEPS_SHOWN = 80
+#: Where an environment draws ways in the place of a context.
+WAYS_SHOWN = 8
 #: Latents in a picture, every so many-th of them.
 LATENTS_SHOWN = 2000
 #: Of a model, and of its episodes that failed.
@@ -33,7 +37,8 @@ def save_plot(readings: Sequence[Reading], path: Path) -> None:
     rewards.legend(loc="lower right", fontsize=8, title="mean, and 10 to 90 %", title_fontsize=8)
     returns.set(xlabel="step", ylabel="return so far")
     returns.legend(loc="lower left", fontsize=8)
-    _draw_context(context, _knows(readings))
+    if not _draw_ways(context, readings):
+        _draw_context(context, _knows(readings))
     save(figure, path)
 
 
@@ -101,6 +106,21 @@ def _draw_returns(axes: Any, result: Evaluation, colour: str, lost: str) -> None
     mean = np.nanmean(_padded([np.cumsum(episode.rewards).tolist() for episode in result.episodes]), axis=0)
     axes.plot(mean, color="black", linewidth=3)
     axes.plot(mean, color=colour, label=result.model.name)
+
+
+def _draw_ways(axes: Any, readings: Sequence[Reading]) -> bool:
+    """Where the episodes went, in an environment that draws that itself; False: it does not."""
+    trial = readings[0].result.trial
+    env = environments.make(trial.env, episode_steps=trial.episode_steps, **trial.env_options)
+    with closing(env):
+        draw = getattr(env.unwrapped, "draw_ways", None)
+        if not callable(draw):
+            return False
+        for one, (colour, _) in zip(readings, itertools.cycle(COLOURS)):
+            shown = one.result.episodes[:WAYS_SHOWN]
+            draw(axes, [(np.array(episode.states), episode.goal) for episode in shown], colour)
+    axes.set_title(f"ways of the first {len(readings[0].result.episodes[:WAYS_SHOWN])} episodes", fontsize=10)
+    return True
 
 
 def _draw_context(axes: Any, reading: Reading) -> None:

@@ -8,7 +8,7 @@ from statistics import fmean
 from ada_diffuser.messages import SamplerOptions
 from ada_diffuser.rollout.choice import Choice, Tried
 from ada_diffuser.rollout.readout import Place, Reading, Readout
-from ada_diffuser.rollout.result import Evaluation, mean_and_error
+from ada_diffuser.rollout.result import Evaluation, Measure, mean_and_error
 from ada_diffuser.rollout.seeds import SeedGroup, by_recipe
 
 #: Options that do nothing at these values, and those that do nothing beside them.
@@ -47,6 +47,7 @@ def _column(reading: Reading) -> list[tuple[str, str]]:
         ("mean return", f"{result.mean_return:.2f} ± {result.standard_error:.2f}"),
         ("median return", f"{result.median_return:.2f}"),
         ("failures", f"{result.failures} of {len(result.episodes)}"),
+        *((name, measured(one)) for name, one in result.measures.items()),
         (f"latency of {call}", f"p50 {result.latency_ms(50):.2f} ms, p99 {result.latency_ms(99):.2f} ms"),
         *((f"  server, {part}", _server_row(result, part)) for part in ("queue", "compute", "commit", "total")),
         ("evaluations an act", f"{result.evaluations_per_act:.2f}"),
@@ -73,7 +74,13 @@ def _difference(result: Evaluation, other: Evaluation) -> str:
 def outcome(result: Evaluation) -> str:
     """In a line of a log."""
     places = f", by episode {' '.join(f'{one.mean_return:.2f}' for one in result.by_index)}" if result.trial.session_episodes > 1 else ""
-    return f"{result.mean_return:.2f} ± {result.standard_error:.2f}{places}, {result.failures} failed, {result.wall_s:.1f} s"
+    measures = "".join(f", {name} {measured(one)}" for name, one in result.measures.items())
+    return f"{result.mean_return:.2f} ± {result.standard_error:.2f}{places}{measures}, {result.failures} failed, {result.wall_s:.1f} s"
+
+
+def measured(measure: Measure | None) -> str:
+    """What an environment says beside the return; nothing where it does not."""
+    return f"{measure.mean:.2f} ± {measure.standard_error:.2f}" if measure else ""
 
 
 def _server_row(result: Evaluation, part: str) -> str:
@@ -88,20 +95,23 @@ def markdown(results: Sequence[Evaluation], settings: Sequence[str]) -> str:
     """
     groups = by_recipe(results)
     error = "± training seeds"
-    heads = ["environment", "model", *settings, "return", error, "median", "failures", "evaluations/act", "p50 ms", "p99 ms"]
-    rows = [_trial_cells(result, settings) for result in results] + [_group_cells(group, settings) for group in groups]
+    measures = list(dict.fromkeys(name for result in results for name in result.measures))
+    heads = ["environment", "model", *settings, "return", error, *measures, "median", "failures", "evaluations/act", "p50 ms", "p99 ms"]
+    rows = [_trial_cells(result, settings, measures) for result in results]
+    rows += [_group_cells(group, settings, measures) for group in groups]
     if not groups:
         _drop(error, heads, rows)
     return rows_of(heads, rows)
 
 
-def _trial_cells(result: Evaluation, settings: Sequence[str]) -> list[str]:
+def _trial_cells(result: Evaluation, settings: Sequence[str], measures: Sequence[str]) -> list[str]:
     return [
         result.trial.env,
         result.model.name,
         *(_setting(getattr(result.options, name)) for name in settings),
         f"{result.mean_return:.2f} ± {result.standard_error:.2f}",
         "",
+        *(measured(result.measures.get(name)) for name in measures),
         f"{result.median_return:.2f}",
         f"{result.failures}/{len(result.episodes)}",
         f"{result.evaluations_per_act:.2f}",
@@ -110,7 +120,7 @@ def _trial_cells(result: Evaluation, settings: Sequence[str]) -> list[str]:
     ]
 
 
-def _group_cells(group: SeedGroup, settings: Sequence[str]) -> list[str]:
+def _group_cells(group: SeedGroup, settings: Sequence[str], measures: Sequence[str]) -> list[str]:
     results = group.results
     return [
         results[0].trial.env,
@@ -118,6 +128,7 @@ def _group_cells(group: SeedGroup, settings: Sequence[str]) -> list[str]:
         *(_setting(getattr(results[0].options, name)) for name in settings),
         f"{group.mean_return:.2f} ± {group.standard_error:.2f}",
         f"± {group.standard_error_training:.2f}",
+        *(measured(group.measures.get(name)) for name in measures),
         f"{group.median_return:.2f}",
         f"{group.failures}/{sum(len(result.episodes) for result in results)}",
         f"{fmean(result.evaluations_per_act for result in results):.2f}",

@@ -73,6 +73,10 @@ class Episode:
     #: States that each act planned, from the one after its chunk on, `(plan_horizon - 1, state_dim)`; where the trial asks for them.
     plans: list[NDArray[np.float32]] = field(default_factory=list)
     failed: bool = False
+    #: What the environment says of it beside its return, by name.
+    measures: dict[str, float] = field(default_factory=dict)
+    #: What was wanted, where the environment has a goal.
+    goal: NDArray[np.float32] | None = None
     #: Its place in the session, from 0.
     index: int = 0
 
@@ -131,6 +135,30 @@ class IndexReturn:
     #: Of the mean, over sessions.
     standard_error: float
     failures: int
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Something that the environment says of each episode beside its return: a score, whether it got where it should."""
+
+    mean: float
+    #: Of the mean, over sessions.
+    standard_error: float
+    #: Of each episode.
+    values: list[float]
+
+    @classmethod
+    def of(cls, sessions: Sequence[Sequence[float]]) -> Measure:
+        """From the numbers of the episodes of each session."""
+        mean, error = mean_and_error([np.array(session) for session in sessions])
+        return cls(mean, error, [value for session in sessions for value in session])
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "mean": round(self.mean, 6),
+            "standard_error": round(self.standard_error, 6),
+            "values": [round(value, 6) for value in self.values],
+        }
 
 
 def mean_and_error(groups: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
@@ -198,6 +226,12 @@ class Evaluation:
         return sum(episode.failed for episode in self.episodes)
 
     @property
+    def measures(self) -> dict[str, Measure]:
+        """What the environment says beside the returns, by name; empty where it says nothing."""
+        names = self.episodes[0].measures
+        return {name: Measure.of([[one.measures[name] for one in session] for session in by_session(self.episodes)]) for name in names}
+
+    @property
     def by_index(self) -> list[IndexReturn]:
         """Returns by the episode's place in its session."""
         found = []
@@ -245,6 +279,7 @@ class Evaluation:
             "standard_error": round(self.standard_error, 6),
             "median_return": round(self.median_return, 6),
             "failures": self.failures,
+            **measures_as_json(self.measures),
             "acts": self.acts.acts,
             "replayed": self.acts.replayed,
             "evaluations_per_act": self.evaluations_per_act,
@@ -273,6 +308,11 @@ class Evaluation:
                 for one in self.by_index
             ],
         }
+
+
+def measures_as_json(measures: Mapping[str, Measure]) -> dict[str, Any]:
+    """Nothing where there are none."""
+    return {"measures": {name: one.as_json() for name, one in measures.items()}} if measures else {}
 
 
 def plain_options(options: dict[str, Any]) -> dict[str, Any]:

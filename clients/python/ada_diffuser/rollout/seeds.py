@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ada_diffuser.rollout.result import Evaluation, by_session, mean_and_error, plain_options
+from ada_diffuser.rollout.result import Evaluation, Measure, by_session, mean_and_error, measures_as_json, plain_options
 
 _SEED = re.compile(r"-seed(\d+)$")
 
@@ -31,8 +31,7 @@ class SeedGroup:
     @property
     def standard_error(self) -> float:
         """Of the mean over sessions, these trainings given: each episode's return is first averaged over the training seeds."""
-        ends = np.cumsum([len(session) for session in by_session(self.results[0].episodes)])
-        return mean_and_error(np.split(self._returns().mean(axis=0), ends[:-1]))[1]
+        return mean_and_error(np.split(self._returns().mean(axis=0), self._ends[:-1]))[1]
 
     @property
     def standard_error_training(self) -> float:
@@ -47,6 +46,15 @@ class SeedGroup:
     @property
     def failures(self) -> int:
         return sum(result.failures for result in self.results)
+
+    @property
+    def measures(self) -> dict[str, Measure]:
+        """Of the mean over training seeds of what the environment says of each episode; the errors are over sessions, as above."""
+        found = {}
+        for name in self.results[0].measures:
+            values = np.mean([result.measures[name].values for result in self.results], axis=0)
+            found[name] = Measure.of([part.tolist() for part in np.split(values, self._ends[:-1])])
+        return found
 
     def as_json(self) -> dict[str, Any]:
         """An entry beside those of its models, told from them by `training_seeds`."""
@@ -65,7 +73,13 @@ class SeedGroup:
             "standard_error_training_seeds": round(self.standard_error_training, 6),
             "median_return": round(self.median_return, 6),
             "failures": self.failures,
+            **measures_as_json(self.measures),
         }
+
+    @property
+    def _ends(self) -> np.ndarray:
+        """Episodes before the end of each session."""
+        return np.cumsum([len(session) for session in by_session(self.results[0].episodes)])
 
     def _returns(self) -> np.ndarray:
         """`(training seeds, episodes)`."""

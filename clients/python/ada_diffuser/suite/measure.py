@@ -47,6 +47,7 @@ def measured(client: Client, cell: Cell, mode: Mode, model: str) -> dict[str, An
         "se": round(result.standard_error, 4),
         "median": round(result.median_return, 4),
         "failures": result.failures,
+        **({"measures": _measures(result)} if result.measures else {}),
         "returns": [round(value, 4) for value in result.returns.tolist()],
         "evaluations_per_act": round(result.evaluations_per_act, 4),
         "p50_ms": round(alone.latency_ms(50), 4),
@@ -55,6 +56,11 @@ def measured(client: Client, cell: Cell, mode: Mode, model: str) -> dict[str, An
         "latents": _latents(result) if drawn and reading.clusters else None,
         "plan": plan(alone.episodes, alone.options.action_horizon or 1, drawn=drawn),
     }
+
+
+def _measures(result: Evaluation) -> dict[str, list[float]]:
+    """What the environment says of each episode beside its return."""
+    return {name: [round(value, 4) for value in one.values] for name, one in result.measures.items()}
 
 
 def _readout(reading: Reading) -> dict[str, Any] | None:

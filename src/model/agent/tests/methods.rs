@@ -1,7 +1,7 @@
 //! Methods beside that of the paper's type (i): states alone with inverse dynamics, wishes, several rows at once, oracles.
 
-use super::*;
-use crate::model::method::{Diffused, Head, Inverse, LatentSource, Target, Told, TrueFuture};
+use super::{candidate::Candidate, *};
+use crate::model::method::{AlphaBar, Diffused, Guide, Head, Inverse, LatentSource, Target, Told, TrueFuture};
 
 fn of_states(latents: bool, schedule: Schedule, network: Inverse) -> Agent {
     let backbone = if latents { unet() } else { Backbone::dit(16, 1, 2) };
@@ -41,6 +41,147 @@ fn plans_of_states() {
     }
 }
 
+fn of_actions(latents: bool, schedule: Schedule, backbone: Backbone) -> Agent {
+    agent_with(latents, 2, backbone, |config| {
+        config.method.plan.diffused = Diffused::Action;
+        config.method.plan.schedule = schedule;
+        if !schedule.is_ladder() {
+            config.trained.sub_steps = vec![1];
+            (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
+        }
+    })
+}
+
+/// A policy gives out actions, as bounded as they are, imagines no states, and costs what a planner does; the first action of a chunk is that
+/// of a chunk of one.
+#[test]
+fn policies_of_actions_alone() {
+    let transformer = |encoder_depth| Backbone::EncoderDecoder { width: 16, depth: 2, heads: 2, encoder_depth, dropout: 0.1 };
+    for (latents, backbone) in [(true, transformer(1)), (true, unet()), (false, transformer(0)), (false, Backbone::dit(16, 1, 2))] {
+        let agent = of_actions(latents, Schedule::LADDER, backbone.clone());
+        for (sub_steps, action_horizon) in [(1, 1), (2, 1), (1, 3), (1, 8)] {
+            let options = SamplerOptions { sub_steps, action_horizon, ..options() };
+            let chunks = run(&agent, 1, &options, 3);
+            let cold = (sub_steps * (HORIZON - 1 + action_horizon)) as u32;
+            assert_eq!((chunks[0].evaluations, chunks[0].start), (cold, Start::Cold));
+            assert_eq!((chunks[1].evaluations, chunks[1].start), ((sub_steps * action_horizon) as u32, Start::Warm));
+            for Chunk { actions, planned_states, predicted_state, .. } in &chunks {
+                assert_eq!((actions.len(), actions[0].len()), (action_horizon, 2));
+                assert!(planned_states.is_empty() && predicted_state.is_empty(), "nobody imagined a state");
+                assert!(actions.iter().flatten().all(|action| action.abs() <= 1.0));
+            }
+        }
+        let one = run(&agent, 2, &options(), 1);
+        let three = run(&agent, 2, &SamplerOptions { action_horizon: 3, ..options() }, 1);
+        assert_eq!(one[0].actions[0], three[0].actions[0]);
+        let at_once = of_actions(latents, Schedule::Uniform { steps: 5 }, backbone);
+        let options = SamplerOptions { action_horizon: 8, kappa: 0.0, streaming: false, ..options() };
+        let chunk = &run(&at_once, 1, &options, 1)[0];
+        assert_eq!((chunk.actions.len(), chunk.evaluations), (8, 5));
+    }
+}
+
+/// Nothing is dropped while serving, so a policy acts by what it is told: the state of now, and the steps before.
+#[test]
+fn policies_see_the_state_and_the_steps_before() {
+    let agent =
+        of_actions(false, Schedule::LADDER, Backbone::EncoderDecoder { width: 16, depth: 1, heads: 2, encoder_depth: 1, dropout: 0.5 });
+    let act = |first: f32, now: f32| {
+        let options = SamplerOptions { streaming: false, ..options() };
+        let (episode, _) =
+            agent.act(&agent.open(4, &options).unwrap(), &Observation { state: vec![first, 0.1, 0.2], ..Observation::default() }).unwrap();
+        agent.act(&episode, &Observation { state: vec![now, 0.1, 0.2], ..Observation::default() }).unwrap().1.actions
+    };
+    assert_eq!(act(0.5, 0.6), act(0.5, 0.6));
+    assert!(act(0.5, 0.6) != act(0.5, -0.6) && act(0.5, 0.6) != act(-0.5, 0.6));
+}
+
+fn of_critics(latents: bool, change: impl FnOnce(&mut ModelConfig)) -> Agent {
+    agent_with(latents, 1, Backbone::Mlp { width: 16, depth: 2, dropout: 0.1 }, |config| {
+        let plan = &mut config.method.plan;
+        (plan.diffused, plan.horizon, plan.level_max, plan.alpha) = (Diffused::Action, 1, 5, AlphaBar::VpLinear);
+        (plan.schedule, plan.target) = (Schedule::Uniform { steps: 5 }, Target::Eps);
+        config.method.guide = Some(Guide::Critic { width: 12 });
+        config.units.returns = Some(Affine { mean: vec![2.0], std: vec![3.0] });
+        (config.trained.sub_steps, config.trained.action_horizons) = (vec![1], vec![1]);
+        (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
+        change(config);
+    })
+}
+
+/// Critics choose the candidate whose first action is worth most to the lesser of them; they lead none, so that nobody can ask for that.
+#[test]
+fn critics_choose_among_actions() {
+    let mut lesser = [0, 0];
+    for (latents, width) in (0..16).map(|i: usize| (i.is_multiple_of(2), 8 + i)) {
+        let (agent, state) = (of_critics(latents, |config| config.method.guide = Some(Guide::Critic { width })), vec![0.4, -0.3, 0.2]);
+        let options = SamplerOptions { candidates: 16, temperature: 1.0, streaming: false, kappa: 0.0, action_horizon: 1, ..options() };
+        let observation = Observation { state: state.clone(), ..Observation::default() };
+        let mut acts = [agent.begin(&agent.open(3, &options).unwrap(), &observation).unwrap()];
+        while !acts[0].is_done() {
+            agent.advance(&mut acts).unwrap();
+        }
+        let critic = agent.networks().critic.as_ref().unwrap();
+        let tensor = |values: &[f32]| candle_core::Tensor::from_slice(values, (1, 1, values.len()), &candle_core::Device::Cpu).unwrap();
+        let normal = tensor(&agent.config().units.normalizer.state.normalize(&state));
+        let both = |window: &Candidate| {
+            let latent = latents.then(|| tensor(window.latents().mean_of_step(0)));
+            let both = critic.q(&normal, &tensor(window.action(0)), latent.as_ref()).unwrap();
+            both.map(|q| q.flatten_all().unwrap().to_vec1::<f32>().unwrap()[0])
+        };
+        let pairs: Vec<[f32; 2]> = acts[0].candidates().iter().map(both).collect();
+        let worths: Vec<f32> = pairs.iter().map(|[a, b]| a.min(*b)).collect();
+        let best = (0..16).max_by(|a, b| worths[*a].total_cmp(&worths[*b])).unwrap();
+        lesser[usize::from(pairs[best][1] < pairs[best][0])] += 1;
+        assert!(worths.iter().any(|worth| *worth < worths[best] - 1e-3), "{worths:?}");
+        let expected = acts[0].candidates()[best].action(0).to_vec();
+        let [act] = acts;
+        let (_, chunk) = agent.finish(act).unwrap();
+        assert_eq!(chunk.actions, [agent.config().units.normalizer.action.denormalize(&expected)]);
+        assert!((chunk.value.unwrap() - (2.0 + 3.0 * worths[best])).abs() < 1e-4);
+        assert_eq!((chunk.evaluations, chunk.passes), (16 * 5, 5));
+        let led = agent.open(1, &SamplerOptions { guidance_scale: 1.0, ..options });
+        assert!(matches!(led, Err(AgentError::InvalidOptions { field: "guidance_scale", .. })), "{led:?}");
+    }
+    assert!(lesser.iter().all(|count| *count > 0), "each critic is the lesser now and then: {lesser:?}");
+    let of_states = ModelConfig::plain(Layout { state_dim: 3, action_dim: 2 }, None, unet());
+    let mut method = of_states.method;
+    (method.plan.diffused, method.guide) = (Diffused::State, Some(Guide::Critic { width: 4 }));
+    method.head = Head::Inverse { network: Inverse::Mlp { width: 4 }, latent: false };
+    let refused = ModelConfig { method, units: Units { returns: Some(Affine::identity(1)), ..of_states.units }, ..of_states }.check();
+    assert_eq!(refused.unwrap_err().field, "method.guide");
+}
+
+/// Acts that choose, side by side with those that do not.
+#[test]
+fn a_batch_of_choosing_acts_is_its_rows() {
+    let agent = of_critics(true, |_| ());
+    let vary = |i: u64| SamplerOptions {
+        candidates: 1 + 5 * (i as usize % 3),
+        pick_temperature: if i.is_multiple_of(2) { 0.0 } else { 0.7 },
+        eta: (i % 2) as f32,
+        temperature: 1.0,
+        streaming: false,
+        kappa: 0.0,
+        ..options()
+    };
+    let mut stream = Philox::new(4);
+    let observations: Vec<Observation> = (0..6).map(|_| observation(&mut stream)).collect();
+    let episodes: Vec<Episode> = (0..6).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
+    let [alone, together] = alone_and_together(&agent, &episodes, &observations);
+    assert_eq!(together, alone);
+}
+
+/// Rows of policies do not influence each other, whatever chunks they are asked for.
+#[test]
+fn a_batch_of_policies_is_its_rows() {
+    for latents in [true, false] {
+        let backbone = Backbone::EncoderDecoder { width: 16, depth: 2, heads: 2, encoder_depth: 1, dropout: 0.1 };
+        let agent = of_actions(latents, Schedule::LADDER, backbone);
+        check_batch(&agent);
+    }
+}
+
 /// The action of a plan of states is that of the inverse dynamics, asked by hand.
 #[test]
 fn actions_lead_from_state_to_state() {
@@ -67,22 +208,23 @@ fn actions_lead_from_state_to_state() {
     }
 }
 
+/// Acts of all kinds side by side give what each gives alone.
+fn check_batch(agent: &Agent) {
+    let vary =
+        |i: u64| SamplerOptions { action_horizon: 1 + i as usize % 3, eta: (i % 2) as f32, picard_window: 1 + i as usize % 3, ..options() };
+    let mut stream = Philox::new(4);
+    let observations: Vec<Observation> = (0..6).map(|_| observation(&mut stream)).collect();
+    let episodes: Vec<Episode> = (0..6).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
+    let [alone, together] = alone_and_together(agent, &episodes, &observations);
+    assert_eq!(together, alone);
+}
+
 /// Rows of plans of states, of both kinds of inverse dynamics, do not influence each other.
 #[test]
 fn a_batch_of_states_is_its_rows() {
     for (latents, network) in [(true, Inverse::Diffusion { width: 8, steps: 3 }), (false, Inverse::Mlp { width: 8 })] {
         let agent = of_states(latents, Schedule::LADDER, network);
-        let vary = |i: u64| SamplerOptions {
-            action_horizon: 1 + i as usize % 3,
-            eta: (i % 2) as f32,
-            picard_window: 1 + i as usize % 3,
-            ..options()
-        };
-        let mut stream = Philox::new(4);
-        let observations: Vec<Observation> = (0..6).map(|_| observation(&mut stream)).collect();
-        let episodes: Vec<Episode> = (0..6).map(|i| agent.open(i, &vary(i)).unwrap()).collect();
-        let [alone, together] = alone_and_together(&agent, &episodes, &observations);
-        assert_eq!(together, alone);
+        check_batch(&agent);
     }
 }
 

@@ -1,6 +1,7 @@
-//! Multi-head attention without a mask, forward and backward, over `(batch, steps, 3 width)` rows that hold q, k, v.
+//! Multi-head attention, forward and backward: over `(batch, steps, 3 width)` rows that hold q, k, v, or over rows of queries and others that
+//! hold k, v.
 //!
-//! Nothing of size steps x steps outlives a head of an item: backward computes the weights again.
+//! Nothing of size queries x keys outlives a head of an item: backward computes the weights again.
 
 use super::{
     math, per_isa,
@@ -13,23 +14,49 @@ use super::{
 pub struct Attention {
     /// Items.
     pub batch: usize,
-    /// Tokens of an item.
-    pub steps: usize,
+    /// Tokens of an item that look.
+    pub queries: usize,
+    /// Tokens of an item that are looked at.
+    pub keys: usize,
     /// Heads.
     pub heads: usize,
     /// Width of a head.
     pub head_dim: usize,
+    /// Whether a token looks only at itself and those before it.
+    pub causal: bool,
 }
 
-/// Which third of a row.
+/// Rows that q, k or v stand in.
 #[derive(Clone, Copy)]
-enum Part {
-    Query,
-    Key,
-    Value,
+pub struct Rows<'a> {
+    /// Of all items.
+    pub values: &'a [f32],
+    /// Numbers of a row.
+    pub stride: usize,
+    /// Where in a row they begin.
+    pub start: usize,
 }
 
-/// A `(steps, head_dim)` or `(steps, steps)` matrix inside a larger slice: rows are `stride` apart.
+/// q, k and v.
+#[derive(Clone, Copy)]
+pub struct Looks<'a> {
+    /// What looks.
+    pub query: Rows<'a>,
+    /// By what it finds.
+    pub key: Rows<'a>,
+    /// What it finds.
+    pub value: Rows<'a>,
+}
+
+/// Where gradients to q, k and v go: their rows are as those of the values.
+pub enum Grads<'a> {
+    /// They stand in the same rows.
+    Together(&'a mut [f32]),
+    /// Queries in rows of their own; k and v in the same ones.
+    Apart(Option<&'a mut [f32]>, Option<&'a mut [f32]>),
+}
+
+/// A `(tokens, head_dim)` or `(queries, keys)` matrix inside a larger slice: rows are `stride` apart.
 #[derive(Clone, Copy)]
 struct Matrix<'a> {
     values: &'a [f32],
@@ -59,12 +86,15 @@ impl Matrix<'_> {
 }
 
 per_isa! {
-    /// `softmax(scale * scores)` by row, in place.
-    fn softmax(scores: &mut [f32], steps: usize, scale: f32) {
-        for row in scores.chunks_exact_mut(steps) {
+    /// `softmax(scale * scores)` by row, in place; `causal`, row i over its first i + 1 scores, the others becoming 0.
+    fn softmax(scores: &mut [f32], keys: usize, scale: f32, causal: bool) {
+        for (i, row) in scores.chunks_exact_mut(keys).enumerate() {
+            let seen = if causal { keys.min(i + 1) } else { keys };
+            let (row, unseen) = row.split_at_mut(seen);
+            unseen.fill(0.0);
             let top = row.iter().fold(f32::NEG_INFINITY, |top, &score| if score > top { score } else { top });
             row.iter_mut().for_each(|score| *score = math::exp((*score - top) * scale));
-            let inverse = 1.0 / math::sum(steps, |i| row[i]);
+            let inverse = 1.0 / math::sum(seen, |i| row[i]);
             row.iter_mut().for_each(|weight| *weight *= inverse);
         }
     }
@@ -80,6 +110,20 @@ per_isa! {
     }
 }
 
+impl<'a> Looks<'a> {
+    /// Of rows that hold q, k and v, each `width` wide.
+    pub fn together(qkv: &'a [f32], width: usize) -> Self {
+        let [query, key, value] = [0, width, 2 * width].map(|start| Rows { values: qkv, stride: 3 * width, start });
+        Self { query, key, value }
+    }
+
+    /// Of rows that hold q, and rows that hold k and v.
+    pub fn apart(q: &'a [f32], kv: &'a [f32], width: usize) -> Self {
+        let [key, value] = [0, width].map(|start| Rows { values: kv, stride: 2 * width, start });
+        Self { query: Rows { values: q, stride: width, start: 0 }, key, value }
+    }
+}
+
 impl Attention {
     fn width(&self) -> usize {
         self.heads * self.head_dim
@@ -89,18 +133,17 @@ impl Attention {
         1.0 / (self.head_dim as f32).sqrt()
     }
 
-    /// Where `part` of a head of an item begins in a slice of `(batch, steps, 3 width)`.
-    fn offset(&self, item: usize, head: usize, part: Part) -> usize {
-        item * self.steps * 3 * self.width() + part as usize * self.width() + head * self.head_dim
+    /// Where a head of an item begins in rows, of which an item has so many.
+    fn offset(&self, rows: Rows, len: usize, (item, head): (usize, usize)) -> usize {
+        item * len * rows.stride + rows.start + head * self.head_dim
     }
 
-    fn part<'a>(&self, qkv: &'a [f32], (item, head): (usize, usize), part: Part) -> Matrix<'a> {
-        let values = &qkv[self.offset(item, head, part)..];
-        Matrix { values, rows: self.steps, columns: self.head_dim, stride: 3 * self.width() }
+    fn part<'a>(&self, rows: Rows<'a>, len: usize, at: (usize, usize)) -> Matrix<'a> {
+        Matrix { values: &rows.values[self.offset(rows, len, at)..], rows: len, columns: self.head_dim, stride: rows.stride }
     }
 
     fn square<'a>(&self, values: &'a [f32]) -> Matrix<'a> {
-        Matrix { values, rows: self.steps, columns: self.steps, stride: self.steps }
+        Matrix { values, rows: self.queries, columns: self.keys, stride: self.keys }
     }
 
     fn each_head(&self) -> impl Iterator<Item = (usize, usize)> + use<> {
@@ -109,37 +152,61 @@ impl Attention {
     }
 
     /// `softmax(q k^T / sqrt(head_dim))` of one head of one item into `weights`.
-    fn weights(&self, qkv: &[f32], at: (usize, usize), weights: &mut [f32]) {
-        let keys = self.part(qkv, at, Part::Key).pack_transposed();
-        self.part(qkv, at, Part::Query).times(&keys, weights, self.steps);
-        softmax(weights, self.steps, self.scale());
+    fn weights(&self, of: &Looks, at: (usize, usize), weights: &mut [f32]) {
+        let keys = self.part(of.key, self.keys, at).pack_transposed();
+        self.part(of.query, self.queries, at).times(&keys, weights, self.keys);
+        softmax(weights, self.keys, self.scale(), self.causal);
     }
 
-    /// `(batch, steps, width)` into `out` from `(batch, steps, 3 width)`.
-    pub fn forward(&self, qkv: &[f32], out: &mut [f32]) {
-        let mut weights = Pooled::take(self.steps * self.steps);
+    /// `(batch, queries, width)` into `out`.
+    pub fn forward(&self, of: &Looks, out: &mut [f32]) {
+        let mut weights = Pooled::take(self.queries * self.keys);
         for at in self.each_head() {
-            self.weights(qkv, at, &mut weights);
-            let values = self.part(qkv, at, Part::Value).pack();
-            let corner = at.0 * self.steps * self.width() + at.1 * self.head_dim;
+            self.weights(of, at, &mut weights);
+            let values = self.part(of.value, self.keys, at).pack();
+            let corner = at.0 * self.queries * self.width() + at.1 * self.head_dim;
             self.square(&weights).times(&values, &mut out[corner..], self.width());
         }
     }
 
-    /// The gradient to `qkv` into `out`, from `grad`, the gradient to the result.
-    pub fn backward(&self, qkv: &[f32], grad: &[f32], out: &mut [f32]) {
-        let (mut weights, mut scores) = (Pooled::take(self.steps * self.steps), Pooled::take(self.steps * self.steps));
-        let stride = 3 * self.width();
+    /// The gradients to q, k and v into `to`, from `grad`, the gradient to the result.
+    pub fn backward(&self, of: &Looks, grad: &[f32], to: &mut Grads) {
+        let (mut weights, mut scores) = (Pooled::take(self.queries * self.keys), Pooled::take(self.queries * self.keys));
         for at in self.each_head() {
-            self.weights(qkv, at, &mut weights);
-            let values = &grad[at.0 * self.steps * self.width() + at.1 * self.head_dim..];
-            let grad = Matrix { values, rows: self.steps, columns: self.head_dim, stride: self.width() };
-            self.square(&weights).transposed_times(&grad.pack(), &mut out[self.offset(at.0, at.1, Part::Value)..], stride);
-            grad.times(&self.part(qkv, at, Part::Value).pack_transposed(), &mut scores, self.steps);
-            softmax_backward(&weights, &mut scores, self.steps, self.scale());
-            let (query, key) = (self.part(qkv, at, Part::Query).pack(), self.part(qkv, at, Part::Key).pack());
-            self.square(&scores).times(&key, &mut out[self.offset(at.0, at.1, Part::Query)..], stride);
-            self.square(&scores).transposed_times(&query, &mut out[self.offset(at.0, at.1, Part::Key)..], stride);
+            self.weights(of, at, &mut weights);
+            let values = &grad[at.0 * self.queries * self.width() + at.1 * self.head_dim..];
+            let grad = Matrix { values, rows: self.queries, columns: self.head_dim, stride: self.width() };
+            let offsets = [(of.query, self.queries), (of.key, self.keys), (of.value, self.keys)];
+            let [query_at, key_at, value_at] = offsets.map(|(rows, len)| self.offset(rows, len, at));
+            if let Some(to) = to.pairs() {
+                self.square(&weights).transposed_times(&grad.pack(), &mut to[value_at..], of.value.stride);
+            }
+            grad.times(&self.part(of.value, self.keys, at).pack_transposed(), &mut scores, self.keys);
+            softmax_backward(&weights, &mut scores, self.keys, self.scale());
+            if let Some(to) = to.queries() {
+                self.square(&scores).times(&self.part(of.key, self.keys, at).pack(), &mut to[query_at..], of.query.stride);
+            }
+            if let Some(to) = to.pairs() {
+                let query = self.part(of.query, self.queries, at).pack();
+                self.square(&scores).transposed_times(&query, &mut to[key_at..], of.key.stride);
+            }
+        }
+    }
+}
+
+impl Grads<'_> {
+    fn queries(&mut self) -> Option<&mut [f32]> {
+        match self {
+            Self::Together(all) => Some(all),
+            Self::Apart(queries, _) => queries.as_deref_mut(),
+        }
+    }
+
+    /// Keys and values.
+    fn pairs(&mut self) -> Option<&mut [f32]> {
+        match self {
+            Self::Together(all) => Some(all),
+            Self::Apart(_, pairs) => pairs.as_deref_mut(),
         }
     }
 }

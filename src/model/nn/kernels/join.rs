@@ -32,6 +32,13 @@ per_isa! {
 }
 
 per_isa! {
+    /// `x[i] *= y[i]`.
+    pub fn multiply(x: &mut [f32], y: &[f32]) {
+        x.iter_mut().zip(y).for_each(|(x, y)| *x *= y);
+    }
+}
+
+per_isa! {
     /// `out[i] = x[i] y[i]`.
     pub fn products(x: &[f32], y: &[f32], out: &mut [f32]) {
         out.iter_mut().zip(x.iter().zip(y)).for_each(|(out, (x, y))| *out = x * y);

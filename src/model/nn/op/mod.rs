@@ -9,7 +9,7 @@ mod norm;
 use super::{
     kernels::{
         activation::{self, Activation},
-        attention::Attention,
+        attention::{Attention, Grads, Looks},
         join,
     },
     weights::{Weight, WeightsRef},
@@ -33,9 +33,16 @@ pub enum Op {
     },
     /// Group norm with Mish, or layer norm; scale and shift.
     Norm(NormKind),
-    /// Multi-head self-attention without a mask (Vaswani et al. 2017, equation 1): `softmax(q k^T / sqrt(head_dim)) v` by head, from
-    /// q, k, v side by side, `(batch, steps, 3 width)`, to `(batch, steps, width)`.
+    /// Multi-head self-attention (Vaswani et al. 2017, equation 1): `softmax(q k^T / sqrt(head_dim)) v` by head, from q, k, v side by side,
+    /// `(batch, steps, 3 width)`, to `(batch, steps, width)`.
     Attention {
+        /// They share the width.
+        heads: usize,
+        /// Whether a step looks only at itself and those before it.
+        causal: bool,
+    },
+    /// The same of q, `(batch, steps, width)`, on the k, v of others, side by side, `(batch, others, 2 width)`.
+    Cross {
         /// They share the width.
         heads: usize,
     },
@@ -69,6 +76,8 @@ pub enum Op {
     },
     /// `x - other`.
     Subtract,
+    /// `x * other`, element by element.
+    Times,
     /// Rows where the other, `(batch, steps, 1)`, is 1; the weight, a vector, where it is 0. The mask gets no gradient.
     OrAbsent {
         /// Channels.
@@ -116,9 +125,9 @@ impl Op {
     /// What becomes of the first input.
     pub fn form(&self) -> Form {
         match self {
-            Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Beside | Self::Channels { .. } => Form::Anew,
-            Self::Step(_) | Self::Flatten | Self::Unflatten { .. } => Form::Anew,
-            Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::Subtract | Self::OrAbsent { .. } => Form::InPlace,
+            Self::Conv(_) | Self::Gru { .. } | Self::Attention { .. } | Self::Cross { .. } | Self::Beside => Form::Anew,
+            Self::Channels { .. } | Self::Step(_) | Self::Flatten | Self::Unflatten { .. } => Form::Anew,
+            Self::Norm(_) | Self::Activation(_) | Self::Modulate | Self::Subtract | Self::Times | Self::OrAbsent { .. } => Form::InPlace,
             Self::AddAtEachStep | Self::AddGated => Form::Sum(1),
             Self::Add => Form::Sum(2),
         }
@@ -137,7 +146,11 @@ impl Op {
             Self::Conv(conv) => beside(&[], true, conv.shape(x)?),
             Self::Gru { hidden } => beside(&[[batch, 1, hidden]], channels == 3 * hidden, [batch, steps, hidden]),
             Self::Norm(norm) => beside(&[], channels == norm.channels, x),
-            Self::Attention { heads } => beside(&[], heads > 0 && channels.is_multiple_of(3 * heads), [batch, steps, channels / 3]),
+            Self::Attention { heads, .. } => beside(&[], heads > 0 && channels.is_multiple_of(3 * heads), [batch, steps, channels / 3]),
+            Self::Cross { heads } => {
+                let keys = others.first().map_or(0, |other| other.shape[1]);
+                beside(&[[batch, keys, 2 * channels]], keys > 0 && heads > 0 && channels.is_multiple_of(heads), x)
+            }
             Self::Activation(_) => beside(&[], true, x),
             Self::Add => beside(&[x], true, x),
             Self::AddAtEachStep => beside(&[[batch, 1, channels]], true, x),
@@ -154,7 +167,7 @@ impl Op {
                 let fits = steps == 1 && into > 0 && channels.is_multiple_of(into);
                 beside(&[], fits, [batch, into, channels / into.max(1)])
             }
-            Self::Subtract => beside(&[x], true, x),
+            Self::Subtract | Self::Times => beside(&[x], true, x),
             Self::OrAbsent { width } => beside(&[[batch, steps, 1]], channels == width, x),
         };
         let shapes = || inputs.iter().map(|input| input.shape).collect::<Vec<_>>();
@@ -192,7 +205,10 @@ impl Op {
             Self::Conv(conv) => conv.forward(inputs[0], weights, out)?,
             Self::Gru { hidden } => gru::forward(hidden, inputs, weights, out)?,
             Self::Norm(norm) => norm.forward(steps, weights, out)?,
-            Self::Attention { heads } => attention(shape, heads).forward(x, out),
+            Self::Attention { heads, causal } => {
+                attention(shape, heads, causal).forward(&Looks::together(x, channels / 3), out);
+            }
+            Self::Cross { heads } => cross(shape, inputs[1].shape, heads).forward(&Looks::apart(x, other(1), channels), out),
             Self::Activation(kind) => activation::in_place(kind, out),
             Self::Add => join::add(out, other(1)),
             Self::AddAtEachStep => {
@@ -210,6 +226,7 @@ impl Op {
             Self::Step(index) => join::copy_columns((x, steps * channels, index * channels), (out, channels, 0), channels),
             Self::Flatten | Self::Unflatten { .. } => out.copy_from_slice(x),
             Self::Subtract => join::subtract(out, other(1)),
+            Self::Times => join::multiply(out, other(1)),
             Self::OrAbsent { .. } => join::or_absent(out, other(1), weights.plain()?),
         }
         Ok(())
@@ -231,7 +248,15 @@ impl Op {
             Self::Conv(conv) => conv.backward(past, to)?,
             Self::Gru { hidden } => gru::backward(hidden, past, to)?,
             Self::Norm(norm) => norm.backward(past, to)?,
-            Self::Attention { heads } => fill(&mut to[0], |dx| attention(inputs[0].shape, heads).backward(x, grad, dx)),
+            Self::Attention { heads, causal } => fill(&mut to[0], |dx| {
+                let of = Looks::together(x, channels / 3);
+                attention(inputs[0].shape, heads, causal).backward(&of, grad, &mut Grads::Together(dx));
+            }),
+            Self::Cross { heads } => {
+                let [queries, pairs, ..] = to else { bail!("slots for q, and k with v: is a bug") };
+                let mut to = Grads::Apart(queries.as_deref_mut(), pairs.as_deref_mut());
+                cross(inputs[0].shape, inputs[1].shape, heads).backward(&Looks::apart(x, other(1), channels), grad, &mut to);
+            }
             Self::Activation(kind) => fill(&mut to[0], |dx| activation::backward(kind, x, dx)),
             Self::Add => {}
             Self::AddAtEachStep => fill(&mut to[1], |de| {
@@ -258,6 +283,10 @@ impl Op {
             Self::Flatten | Self::Unflatten { .. } => fill(&mut to[0], |dx| dx.copy_from_slice(grad)),
             // The slot of `x` holds its gradient already.
             Self::Subtract => fill(&mut to[1], |dy| dy.iter_mut().zip(grad).for_each(|(dy, grad)| *dy = -grad)),
+            Self::Times => {
+                fill(&mut to[0], |dx| join::multiply(dx, other(1)));
+                fill(&mut to[1], |dy| join::products(grad, x, dy));
+            }
             Self::OrAbsent { .. } => {
                 if to[1].is_some() {
                     bail!("a mask gets no gradient");
@@ -277,8 +306,12 @@ pub(super) fn fill(slot: &mut Slot, write: impl FnOnce(&mut [f32])) {
     }
 }
 
-fn attention([batch, steps, width]: [usize; 3], heads: usize) -> Attention {
-    Attention { batch, steps, heads, head_dim: width / (3 * heads) }
+fn attention([batch, steps, width]: [usize; 3], heads: usize, causal: bool) -> Attention {
+    Attention { batch, queries: steps, keys: steps, heads, head_dim: width / (3 * heads), causal }
+}
+
+fn cross([batch, queries, width]: [usize; 3], [_, keys, _]: [usize; 3], heads: usize) -> Attention {
+    Attention { batch, queries, keys, heads, head_dim: width / heads, causal: false }
 }
 
 /// Inputs that lie side by side, each with its first column, and the width of all.

@@ -4,6 +4,7 @@ use super::links::Links;
 use std::{fs::File, io::Read, path::Path};
 
 const WAY_OUT: &str = "docs/data.md shows how to write its steps into such a file";
+const IMPORTED: &str = "`ada-import` makes such a file of it (docs/data.md)";
 
 /// Beginnings of files that are not HDF5.
 const BEGINNINGS: [(&[u8], &str); 4] = [
@@ -26,7 +27,8 @@ const FOLDERS: [(&str, &str); 5] = [
 pub fn not_hdf5(path: &Path) -> Option<String> {
     if path.is_dir() {
         let what = FOLDERS.iter().find(|(name, _)| path.join(name).exists()).map_or("not a file", |(_, what)| what);
-        return Some(format!("is a folder ({what}), expected an HDF5 file; {WAY_OUT}"));
+        let way_out = if what.contains("Minari") { IMPORTED } else { WAY_OUT };
+        return Some(format!("is a folder ({what}), expected an HDF5 file; {way_out}"));
     }
     let mut head = Vec::new();
     File::open(path).ok()?.take(8).read_to_end(&mut head).ok()?;
@@ -47,7 +49,7 @@ pub fn other_layout(root: &Links, inside_data: &Links) -> Option<String> {
     } else {
         return None;
     };
-    Some(format!("this is a file of {what}, with a group for each episode (`{group}`); {WAY_OUT}"))
+    Some(format!("this is a file of {what}, with a group for each episode (`{group}`); {IMPORTED}"))
 }
 
 /// The names there are, for one that is missing.

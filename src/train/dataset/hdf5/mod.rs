@@ -63,7 +63,8 @@ pub fn read(path: &Path, room: &Room) -> Result<Dataset, DatasetError> {
     for array in [&observations, &actions, &rewards].into_iter().chain(optional).chain(&terminals).chain(&timeouts) {
         arrays.check(array, rows)?;
     }
-    let rows_of = spans(&arrays.flags(terminals.iter().chain(&timeouts), rows)?);
+    let [ended, timed_out] = [arrays.flags(terminals.iter(), rows)?, arrays.flags(timeouts.iter(), rows)?];
+    let rows_of = spans(&ended.iter().zip(&timed_out).map(|(ended, timed_out)| *ended || *timed_out).collect::<Vec<_>>());
     let mut notes = Vec::new();
     if timeouts.is_empty() {
         let longest = rows_of.iter().map(Range::len).max().unwrap_or(0);
@@ -85,6 +86,8 @@ pub fn read(path: &Path, room: &Room) -> Result<Dataset, DatasetError> {
     let episode = |(index, rows): (usize, &Range<usize>)| Span {
         rows: rows.clone(),
         play: play.as_ref().is_some_and(|play| play[index] != 0.0),
+        // Where a file says both, time was up.
+        ended: ended[rows.end - 1] && !timed_out[rows.end - 1],
         // What came of an episode's last act no other act tells.
         before: follows(index).then(|| rows_of[index - 1].start..rows_of[index - 1].end - 1).filter(|before| !before.is_empty()),
     };

@@ -36,6 +36,11 @@ class Estimate:
         return self.mean / error if error else math.copysign(math.inf, self.mean)
 
     @classmethod
+    def over(cls, values: NDArray[np.float64]) -> Estimate:
+        """Of one number an episode, `(training seeds, episodes)`."""
+        return cls(float(values.mean()), _error(values.mean(axis=1)), _error(values.mean(axis=0)))
+
+    @classmethod
     def of(cls, values: Sequence[float]) -> Estimate:
         """Of one number a training seed."""
         return cls(float(np.mean(values)), _error(np.array(values)))
@@ -55,7 +60,13 @@ class Group:
     @property
     def estimate(self) -> Estimate:
         """Of the return; each episode's is first averaged over the training seeds."""
-        return Estimate(float(self.returns.mean()), _error(self.returns.mean(axis=1)), _error(self.returns.mean(axis=0)))
+        return Estimate.over(self.returns)
+
+    @property
+    def measures(self) -> dict[str, Estimate]:
+        """Of what the environment says of its episodes beside their returns, by name; empty where it says nothing."""
+        names = self.files[0].get("measures", {})
+        return {name: Estimate.over(np.array([file["measures"][name] for file in self.files])) for name in names}
 
     @property
     def median(self) -> float:
@@ -69,7 +80,7 @@ class Group:
         """How much more this one earns, on the same episodes, seed by training seed; None where they have no seed in common."""
         mine, theirs = self._by_seed(), other._by_seed()
         gaps = np.array([mine[seed] - theirs[seed] for seed in mine if seed in theirs])
-        return Estimate(float(gaps.mean()), _error(gaps.mean(axis=1)), _error(gaps.mean(axis=0))) if len(gaps) else None
+        return Estimate.over(gaps) if len(gaps) else None
 
     def worse_than(self, other: Group) -> tuple[int, int]:
         """In how many episodes it earned less, and of how many, of the training seeds that both have: what one episode that flies off says

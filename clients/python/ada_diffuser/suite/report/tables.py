@@ -67,7 +67,8 @@ def returns(results: Results, mode: Mode) -> str:
         if group is None:
             return NOTHING
         few = "" if len(group.files) == len(suite.seeds) else f", {len(group.files)} of {len(suite.seeds)} seeds"
-        return f"{estimate(group.estimate)}<br>{number(group.median)}, {group.failures} of {group.returns.size} failed{few}"
+        said = "".join(f"<br>{name} {estimate(one)}" for name, one in group.measures.items())
+        return f"{estimate(group.estimate)}{said}<br>{number(group.median)}, {group.failures} of {group.returns.size} failed{few}"
 
     heads, rows = ["method"], [[method.name] for method in results.methods]
     for environment in results.environments:
@@ -85,9 +86,16 @@ def returns(results: Results, mode: Mode) -> str:
     )
     caption = (
         f"Return, {mode}: mean over {_seeds(results)} and {suite.episodes} episodes ± standard error over training seeds ± over episodes; "
-        f"below it the median, and how many failed.{paper_told}"
+        f"below it the median, and how many failed.{_said(results)}{paper_told}"
     )
     return _captioned(caption, heads, rows)
+
+
+def _said(results: Results) -> str:
+    """What stands between return and median."""
+    names = dict.fromkeys(name for group in results.groups.values() for name in group.measures)
+    score = " (score: 0 and 100 are the random and the expert return of D4RL)" if "score" in names else ""
+    return f" Between them what an environment says of its episodes, with the same two errors: {', '.join(names)}{score}." if names else ""
 
 
 def differences(results: Results, mode: Mode) -> str | None:
