@@ -291,13 +291,17 @@ fn check_guide(guide: Option<&Guide>, plan: &Diffusion, latent: &LatentSource) -
             require(acts, "method.guide", "critic needs windows with actions, of which it judges the first")?;
             size("method.guide.width", *width, WIDTH_MAX)
         }
-        Some(Guide::DecoderReturn) => {
+        Some(guide @ (Guide::DecoderReturn | Guide::Dual { .. })) => {
+            if let Guide::Dual { discrepancy } = guide {
+                let reason = format!("is {discrepancy}, must be 0 or above, and finite");
+                require(discrepancy.is_finite() && *discrepancy >= 0.0, "method.guide.discrepancy", reason)?;
+            }
             // Beside a baseline the decoder tells what is surprising of a reward, and the rest is not the latent's.
             let tells = latent.gru().is_some_and(|gru| gru.baseline.is_none());
-            let reason = "decoder_return needs a latent whose decoder tells rewards (method.latent of kind gru without a baseline)";
+            let reason = "of this kind needs a latent whose decoder tells rewards (method.latent of kind gru without a baseline)";
             require(tells, "method.guide", reason)?;
             let acts = plan.diffused == Diffused::StateAction;
-            require(acts, "method.guide", "decoder_return needs windows of states and actions: a reward is told of both")
+            require(acts, "method.guide", "of this kind needs windows of states and actions: a reward is told of both")
         }
     }
 }

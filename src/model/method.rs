@@ -95,7 +95,7 @@ pub enum Inverse {
 }
 
 /// What judges a window.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Guide {
     /// A network that tells the return of noisy windows (half a temporal U-Net, Janner et al. 2022).
@@ -105,6 +105,12 @@ pub enum Guide {
     },
     /// The rewards that the latent's decoder tells of the window's steps: no further network ("computed return" of the paper).
     DecoderReturn,
+    /// The same less what the decoder finds wrong with the window: how far its states are from those that the decoder tells of the steps before
+    /// (the dual guide of MetaDiffuser, Ni et al. 2023).
+    Dual {
+        /// Weight of the discrepancy: the mean square, in variances of the state's change, beside a return in standard deviations of the data's.
+        discrepancy: f32,
+    },
     /// Critics of the first action, learned from what came of actions (implicit Q-learning, Kostrikov et al. 2022; as IDQL, Hansen-Estruch et
     /// al. 2023, they choose among candidates and lead none).
     Critic {
@@ -117,7 +123,7 @@ impl Guide {
     /// Whether its gradient leads a window on its way down.
     pub fn leads(&self) -> bool {
         match self {
-            Self::Value { .. } | Self::DecoderReturn => true,
+            Self::Value { .. } | Self::DecoderReturn | Self::Dual { .. } => true,
             Self::Critic { .. } => false,
         }
     }

@@ -36,7 +36,7 @@ impl Networks {
         let latent = method.latent.gru().map(|latent| LatentModel::new(latent, layout, &led.scope("latent")));
         let (inverse, guide) = (InverseDynamics::new(layout, method, &params.scope("inverse"))?, &led.scope("guide"));
         let value = match &method.guide {
-            None | Some(Guide::DecoderReturn | Guide::Critic { .. }) => None,
+            None | Some(Guide::DecoderReturn | Guide::Dual { .. } | Guide::Critic { .. }) => None,
             Some(Guide::Value { widths }) => {
                 let Diffusion { horizon, level_max, .. } = method.plan;
                 let sizes = Sizes { columns: method.plan.width(layout.widths()), latent_dim: method.latent.dim(), horizon, widths };

@@ -155,6 +155,7 @@ fn ticks_of_other_methods_allocate_nothing() {
     for (agent, told, context) in [
         (guided(Guide::Value { widths: vec![8, 16] }), false, None),
         (guided(Guide::DecoderReturn), false, None),
+        (guided(Guide::Dual { discrepancy: 0.5 }), false, None),
         (of_states, true, None),
         (policy, false, None),
         (chosen, false, None),

@@ -6,7 +6,8 @@
 //! omega = 1.5 means something.
 //!
 //! The worth of a window is told by a network of values at the window as it stands ([`crate::model::critic::Value`]); or it is the return that the
-//! latent's decoder tells of the clean estimate, and needs no network of its own ("computed return"). Either may be asked in the *future*: the
+//! latent's decoder tells of the clean estimate, and needs no network of its own ("computed return"), if wanted less what the decoder finds
+//! wrong with the estimate (dual guidance, Ni et al. 2023). Any may be asked in the *future*: the
 //! estimate is noised again and denoised, and the gradient goes through the denoiser, averaged over several (Monte Carlo guidance, Chen et al. 2024).
 
 use super::descent::Walk;
@@ -14,7 +15,7 @@ use crate::model::{
     Networks,
     config::ModelConfig,
     denoiser::Given,
-    method::Target,
+    method::{Guide, Target},
     nn::{Activations, Buffer, Traced, gradient},
 };
 use candle_core::{Result, bail};
@@ -66,7 +67,7 @@ impl Judge<'_> {
         // A value network knows noise; the decoder of rewards does not.
         let at = if self.networks.guide.is_some() { &seat.x } else { &seat.estimate };
         let worth = |[x]: [Traced; 1]| self.worth_of(&x, &seat.levels, constant(seat.latents.as_ref())?.as_ref());
-        let (_, [gradient]) = gradient([at.clone()], worth, |_, seed| self.seed(seed))?;
+        let (_, [gradient]) = gradient([at.clone()], worth, |result, seed| self.seed(result, seed))?;
         Ok(gradient)
     }
 
@@ -82,7 +83,7 @@ impl Judge<'_> {
                 Given { latents: latents.as_ref(), observed: observed.as_ref(), told: told.as_ref(), ..Given::levels(&seat.levels) };
             self.worth_of_denoised(&x, &given)
         };
-        let (_, [mut gradient]) = gradient([self.noised(seat, futures)?], worth, |_, seed| self.seed(seed))?;
+        let (_, [mut gradient]) = gradient([self.noised(seat, futures)?], worth, |result, seed| self.seed(result, seed))?;
         // From the noised estimate to the estimate.
         gradient.iter_mut().enumerate().for_each(|(i, gradient)| *gradient *= self.kept(seat, futures, i).0);
         Ok(gradient)
@@ -95,8 +96,11 @@ impl Judge<'_> {
         let given = Given { latents, observed, told: futures.told.as_ref(), ..Given::levels(&seat.levels) };
         let mut worth = self.worth_of_denoised(&self.noised(seat, futures)?, &given)?;
         let mut seed = worth.to_vec();
-        self.seed(&mut seed);
+        self.seed(&worth, &mut seed);
         worth.iter_mut().zip(seed).for_each(|(worth, seed)| *worth *= seed);
+        // A square is half its argument times its slope.
+        let columns = worth.shape()?[2];
+        worth.chunks_exact_mut(columns).for_each(|step| step[1..].iter_mut().for_each(|square| *square /= 2.0));
         Ok(worth)
     }
 
@@ -132,12 +136,25 @@ impl Judge<'_> {
         if self.networks.guide.is_some() {
             return Ok(worth);
         }
+        let columns = worth.shape()?[2];
         Buffer::generate([batch, 1, 1], |out| {
-            out.iter_mut().zip(worth.chunks_exact(len)).for_each(|(out, rewards)| *out = self.return_of(rewards));
+            for (out, steps) in out.iter_mut().zip(worth.chunks_exact(len * columns)) {
+                let squares = steps.chunks_exact(columns).take(len - 1).flat_map(|step| &step[1..]).map(|residual| residual * residual);
+                let count = ((len - 1) * (columns - 1)).max(1) as f32;
+                *out = self.return_of(steps.iter().step_by(columns)) - self.discrepancy().unwrap_or(0.0) * squares.sum::<f32>() / count;
+            }
         })
     }
 
-    /// `(B, 1, 1)` the value, or `(B, T, 1)` the reward of each step.
+    /// Weight of what is wrong with a window, of a guide that asks.
+    fn discrepancy(self) -> Option<f32> {
+        match self.config.method.guide {
+            Some(Guide::Dual { discrepancy }) => Some(discrepancy),
+            None | Some(Guide::Value { .. } | Guide::DecoderReturn | Guide::Critic { .. }) => None,
+        }
+    }
+
+    /// `(B, 1, 1)` the value, or of each step `(B, T, ..)` the reward, and for a dual guide how far the next state is from what is told of it.
     fn worth_of<V: Activations>(self, x: &V, levels: &[f32], latents: Option<&V>) -> Result<V> {
         match (&self.networks.guide, &self.networks.latent) {
             (Some(value), _) => value.predict(x, &Given { latents, ..Given::levels(levels) }),
@@ -145,10 +162,28 @@ impl Judge<'_> {
                 let columns = self.walk.columns;
                 let part = |columns: &std::ops::Range<usize>| x.channels(columns.start, columns.len());
                 let Some(latents) = latents else { bail!("rewards are told of latents") };
-                latent.decoder.reward(&part(&columns.state)?, &part(&columns.action)?, latents)
+                let (state, action) = (part(&columns.state)?, part(&columns.action)?);
+                if self.discrepancy().is_none() {
+                    return latent.decoder.reward(&state, &action, latents);
+                }
+                let told = latent.decoder.predict(&state, &action, latents)?;
+                V::beside(&[&told.reward, &self.change(&state)?.minus(&told.state)?])
             }
             (None, None) => bail!("this model has no guide"),
         }
+    }
+
+    /// How states `(B, T, S)` change to the next step, in the units in which the decoder tells it; of the last one 0.
+    fn change<V: Activations>(self, state: &V) -> Result<V> {
+        let [batch, len, width] = state.shape()?;
+        let (flat, std) = (state.flattened()?, &self.config.units.normalizer.state_change_std);
+        let [later, last] = [flat.channels(width, (len - 1) * width)?, flat.channels((len - 1) * width, width)?];
+        let next = V::beside(&[&later, &last])?.unflattened(len)?;
+        let scale = V::generate([batch, len, 2 * width], |out| {
+            let scales = out.chunks_exact_mut(2 * width).flat_map(|row| &mut row[width..]);
+            scales.zip(std.iter().cycle()).for_each(|(scale, std)| *scale = 1.0 / std - 1.0);
+        })?;
+        next.minus(state)?.modulated(&scale)
     }
 
     /// From what the denoiser says of `x` to the clean window, as [`super::process::Process::x0`].
@@ -169,20 +204,23 @@ impl Judge<'_> {
         said.modulated(&share((0.0, 1.0))?)?.plus(&x.clone().modulated(&share((1.0, 0.0))?)?)
     }
 
-    /// The gradient to what [`Self::worth_of`] says: of rewards the discounted sum counts.
-    fn seed(self, seed: &mut [f32]) {
-        match &self.networks.guide {
-            Some(_) => seed.fill(1.0),
-            None => {
-                let len = self.config.method.plan.horizon;
-                let discount = self.config.method.discount;
-                seed.iter_mut().enumerate().for_each(|(i, seed)| *seed = discount.powi((i % len) as i32));
-            }
+    /// The gradient to what [`Self::worth_of`] says: of rewards the discounted sum counts, and of what is wrong the squares.
+    fn seed(self, result: &[f32], seed: &mut [f32]) {
+        if self.networks.guide.is_some() {
+            return seed.fill(1.0);
+        }
+        let (len, discount, weight) = (self.config.method.plan.horizon, self.config.method.discount, self.discrepancy());
+        let columns = 1 + weight.map_or(0, |_| self.walk.columns.state.len());
+        let weight = weight.unwrap_or(0.0);
+        for (i, (result, seed)) in result.chunks_exact(columns).zip(seed.chunks_exact_mut(columns)).enumerate() {
+            seed[0] = discount.powi((i % len) as i32);
+            let counts = if i % len + 1 < len { -2.0 * weight / (columns - 1).max(1) as f32 } else { 0.0 };
+            seed[1..].iter_mut().zip(&result[1..]).for_each(|(seed, residual)| *seed = counts * residual);
         }
     }
 
     /// The discounted mean of rewards, standard deviations of the data's returns.
-    fn return_of(self, rewards: &[f32]) -> f32 {
+    fn return_of<'r>(self, rewards: impl Iterator<Item = &'r f32>) -> f32 {
         let (mut sum, mut weights, mut weight) = (0.0, 0.0, 1.0);
         for reward in rewards {
             (sum, weights) = (sum + weight * reward, weights + weight);

@@ -41,7 +41,12 @@ fn seat(agent: &Agent) -> (Seat, Futures) {
 /// The gradient through noise, denoiser and guide, whatever the target, is the slope of what it is the gradient of.
 #[test]
 fn gradients_in_the_future_are_slopes() {
-    for (latents, guide, target) in [(true, value(), Target::X0), (true, Guide::DecoderReturn, Target::V), (false, value(), Target::Eps)] {
+    for (latents, guide, target) in [
+        (true, value(), Target::X0),
+        (true, Guide::DecoderReturn, Target::V),
+        (true, Guide::Dual { discrepancy: 0.7 }, Target::X0),
+        (false, value(), Target::Eps),
+    ] {
         let agent = guided(latents, guide, target);
         let (seat, futures) = seat(&agent);
         let gradient = agent.judge().gradient_in_future(&seat, &futures).unwrap();
@@ -65,6 +70,35 @@ fn gradients_in_the_future_are_slopes() {
     }
 }
 
+/// Dual guidance holds a window to be worth its return less the mean square of how its states differ from what the decoder tells of the steps before,
+/// in the units of the state's change.
+#[test]
+fn what_is_wrong_with_a_window_is_taken_off() {
+    let change_std = vec![0.5, 2.0, 4.0];
+    let agent = |guide: Guide| {
+        agent_with(true, 1, Backbone::Unet { widths: vec![8, 16] }, |config| {
+            config.method.guide = Some(guide);
+            config.units.returns = Some(Affine { mean: vec![-1.0], std: vec![0.5] });
+            config.units.normalizer.state_change_std.clone_from(&change_std);
+        })
+    };
+    let (plain, dual) = (agent(Guide::DecoderReturn), agent(Guide::Dual { discrepancy: 0.7 }));
+    let (Seat { estimate: x, latents, .. }, _) = seat(&dual);
+    let [plain, worth] = [&plain, &dual].map(|agent| agent.judge().worth(&x, latents.as_ref()).unwrap().to_vec());
+    let decoder = &dual.networks().latent.as_ref().unwrap().decoder;
+    let told = decoder.predict(&x.channels(0, 3).unwrap(), &x.channels(3, 2).unwrap(), latents.as_ref().unwrap()).unwrap();
+    for row in 0..3 {
+        let mut squares = 0.0;
+        for (step, column) in (0..HORIZON - 1).flat_map(|step| (0..3).map(move |column| (step, column))) {
+            let at = |step: usize| x[(row * HORIZON + step) * 5 + column];
+            let change = (at(step + 1) - at(step)) / change_std[column];
+            squares += (change - told.state[(row * HORIZON + step) * 3 + column]).powi(2);
+        }
+        let expected = plain[row] - 0.7 * squares / (3 * (HORIZON - 1)) as f32;
+        assert!((worth[row] - expected).abs() < 1e-4 * expected.abs().max(1.0), "{} {expected}", worth[row]);
+    }
+}
+
 /// `x0 += omega sigma^2 g`, and no position's gradient is longer than 1.
 #[test]
 fn estimates_are_led_by_hand() {
@@ -84,7 +118,7 @@ fn estimates_are_led_by_hand() {
 /// The farther a window is led, the more its guide holds it to be worth; 0 leads nowhere, and costs nothing.
 #[test]
 fn guided_windows_are_worth_more() {
-    for (guide, target) in [(value(), Target::X0), (Guide::DecoderReturn, Target::X0)] {
+    for (guide, target) in [(value(), Target::X0), (Guide::DecoderReturn, Target::X0), (Guide::Dual { discrepancy: 0.1 }, Target::X0)] {
         let agent = guided(true, guide, target);
         let worth = |scale: f32, samples: usize| -> f32 {
             let options = SamplerOptions { guidance_scale: scale, guidance_samples: samples, temperature: 1.0, ..options() };
@@ -103,7 +137,12 @@ fn guided_windows_are_worth_more() {
 /// Guided or not, in the future or now, one window or several: rows do not influence each other.
 #[test]
 fn a_guided_batch_is_its_rows() {
-    for (latents, guide, target) in [(true, value(), Target::V), (true, Guide::DecoderReturn, Target::X0), (false, value(), Target::X0)] {
+    for (latents, guide, target) in [
+        (true, value(), Target::V),
+        (true, Guide::DecoderReturn, Target::X0),
+        (true, Guide::Dual { discrepancy: 0.7 }, Target::X0),
+        (false, value(), Target::X0),
+    ] {
         let agent = guided(latents, guide, target);
         let vary = |i: u64| SamplerOptions {
             guidance_scale: [0.0, 1.5, 3.0, 1.0][i as usize % 4],
