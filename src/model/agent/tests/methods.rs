@@ -1,6 +1,7 @@
 //! Methods beside that of the paper's type (i): states alone with inverse dynamics, wishes, several rows at once, oracles.
 
 use super::{candidate::Candidate, *};
+use crate::model::critic::Critic;
 use crate::model::method::{AlphaBar, Diffused, Guide, Head, Inverse, LatentSource, Target, Told, TrueFuture};
 
 fn of_states(latents: bool, schedule: Schedule, network: Inverse) -> Agent {
@@ -109,12 +110,25 @@ fn of_critics(latents: bool, change: impl FnOnce(&mut ModelConfig)) -> Agent {
     })
 }
 
+/// Fresh critics, the one in the place of the other if they are swapped.
+fn critics(agent: &Agent, swapped: bool) -> Option<Critic> {
+    let (config, fresh) = (agent.config(), Params::fresh(3));
+    Networks::critic(config.layout, &config.method, &fresh).unwrap();
+    let name = |name: String| match name.split_once(".q") {
+        Some((front, rest)) if swapped => format!("{front}.q{}{}", if rest.starts_with('1') { 2 } else { 1 }, &rest[1..]),
+        _ => name,
+    };
+    let tensors = fresh.vars().into_iter().map(|(key, var)| (name(key), var.as_tensor().clone())).collect();
+    Networks::critic(config.layout, &config.method, &Params::loaded(tensors)).unwrap()
+}
+
 /// Critics choose the candidate whose first action is worth most to the lesser of them; they lead none, so that nobody can ask for that.
 #[test]
 fn critics_choose_among_actions() {
     let mut lesser = [0, 0];
-    for (latents, width) in (0..16).map(|i: usize| (i.is_multiple_of(2), 8 + i)) {
-        let (agent, state) = (of_critics(latents, |config| config.method.guide = Some(Guide::Critic { width })), vec![0.4, -0.3, 0.2]);
+    for (latents, swapped) in [(true, true), (true, false), (false, true), (false, false)] {
+        let (mut agent, state) = (of_critics(latents, |_| ()), vec![0.4, -0.3, 0.2]);
+        agent.networks.critic = critics(&agent, swapped);
         let options = SamplerOptions { candidates: 16, temperature: 1.0, streaming: false, kappa: 0.0, action_horizon: 1, ..options() };
         let observation = Observation { state: state.clone(), ..Observation::default() };
         let mut acts = [agent.begin(&agent.open(3, &options).unwrap(), &observation).unwrap()];
