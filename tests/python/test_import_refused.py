@@ -380,7 +380,10 @@ def test_an_import_that_is_stopped_leaves_nothing() -> None:
         for name in ("terminals", "timeouts"):
             file.create_dataset(name, (rows,), "?")
     command = [sys.executable, "-m", "ada_diffuser.commands.import_", "large.hdf5", "--out", "out/x.h5"]
+    # A shell's background job is deaf to it, and so would be what it starts.
+    heard = signal.signal(signal.SIGINT, signal.SIG_DFL)
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"})
+    signal.signal(signal.SIGINT, heard)
     while run.poll() is None and not Path("out/.x.h5.partial").exists():
         time.sleep(0.01)
     run.send_signal(signal.SIGINT)
