@@ -242,25 +242,25 @@ def median_ms(run: Callable[[], object], seconds: float) -> float:
     return round(sorted(times)[len(times) // 2] * 1e3, 4)
 
 
-def time_acts(model: Path, options: Options, mode: Mode, seconds: float) -> dict[str, object]:
+def time_acts(make: Callable[[Mode], Any], mode: Mode, temperature: float, is_led: bool, seconds: float) -> dict[str, object]:
     """What one mode takes, or why it cannot run (no C++ compiler, say)."""
     torch.compiler.reset()
     # Inference mode lets nobody have gradients, inside of it neither.
-    without_gradients = torch.no_grad() if options.guidance_scale > 0 else torch.inference_mode()
+    without_gradients = torch.no_grad() if is_led else torch.inference_mode()
     try:
         with torch.backends.mkldnn.flags(enabled=mode.onednn), without_gradients:
-            sampler = Sampler(model, options, mode)
+            sampler = make(mode)
             state = torch.arange(sampler.state).float().sin()
             action, value = sampler.act(state, 0.0)
             line = {"action": action.tolist(), "value": None if value is None else value.item()}
-            return {"mode": mode.name(), "ms": median_ms(lambda: sampler.act(state, options.temperature), seconds), **line}
+            return {"mode": mode.name(), "ms": median_ms(lambda: sampler.act(state, temperature), seconds), **line}
     except Exception as error:
         return {"mode": mode.name(), "error": str(error)[:200]}
 
 
-def main() -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(about: str | None, sampler: Callable[[Path, Any, Mode], Any], options_of: Callable[..., Any]) -> None:
+    """Entry point of each program that times acts: `sampler` makes one that acts in a mode, of a checkpoint and its options."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, required=True, metavar="DIR")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--threads", type=int, default=1)
@@ -269,10 +269,12 @@ def main() -> None:
     a = parser.parse_args()
     torch.manual_seed(0)
     torch.set_num_threads(a.threads)
-    options = Options(**{key: json.loads(value) for key, value in (setting.split("=") for setting in a.settings)})
-    for mode in modes(a.modes.split(","), options.guidance_scale > 0):
-        print(json.dumps(time_acts(a.model, options, mode, a.seconds)), flush=True)
+    options = options_of(**{key: json.loads(value) for key, value in (setting.split("=") for setting in a.settings)})
+    is_led = getattr(options, "guidance_scale", 0.0) > 0
+    for mode in modes(a.modes.split(","), is_led):
+        line = time_acts(lambda mode: sampler(a.model, options, mode), mode, options.temperature, is_led, a.seconds)
+        print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__, Sampler, Options)

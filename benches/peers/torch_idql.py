@@ -11,7 +11,6 @@ To the peer's favour: all that depends on the levels alone is computed once and 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from dataclasses import dataclass
@@ -22,8 +21,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
-from torch_acts import LEVEL, TOLD_HIDDEN, Mode, loaded, median_ms, modes
-from torch_denoisers import MODES, sinusoid
+from torch_acts import LEVEL, TOLD_HIDDEN, Mode, loaded, main
+from torch_denoisers import sinusoid
 
 TIME, BETAS = 64, (0.1, 10.0)
 
@@ -122,35 +121,5 @@ class Sampler:
         return x[best], values[best]
 
 
-def time_acts(model: Path, options: Options, mode: Mode, seconds: float) -> dict[str, object]:
-    """What one mode takes, or why it cannot run (no C++ compiler, say)."""
-    torch.compiler.reset()
-    try:
-        with torch.backends.mkldnn.flags(enabled=mode.onednn), torch.inference_mode():
-            sampler = Sampler(model, options, mode)
-            state = torch.arange(sampler.state).float().sin()
-            action, value = sampler.act(state, 0.0)
-            line = {"action": action.tolist(), "value": value.item()}
-            return {"mode": mode.name(), "ms": median_ms(lambda: sampler.act(state, options.temperature), seconds), **line}
-    except Exception as error:
-        return {"mode": mode.name(), "error": str(error)[:200]}
-
-
-def main() -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--modes", default=",".join(MODES), help="which modes run (default %(default)s)")
-    a = parser.parse_args()
-    torch.manual_seed(0)
-    torch.set_num_threads(a.threads)
-    options = Options(**{key: json.loads(value) for key, value in (setting.split("=") for setting in a.settings)})
-    for mode in modes(a.modes.split(","), False):
-        print(json.dumps(time_acts(a.model, options, mode, a.seconds)), flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    main(__doc__, Sampler, Options)
