@@ -55,6 +55,7 @@
 //! | several rows of the table at once (Picard iteration) | [`model::diffusion::picard`] |
 //! | what a window is worth, and the way to better ones | [`model::critic::Value`], [`model::diffusion::guidance`], [`model::nn::gradient()`] |
 //! | actions of a plan of states | [`model::head::InverseDynamics`], [`model::diffusion::inverse`] |
+//! | a skill: what its code stands for, and what it is worth | [`model::head::Skills`], [`model::critic::SkillTransitions`] |
 //! | blocks that networks over windows share | [`model::temporal`] |
 //! | a layer: its shape, forward and backward | [`model::nn`], `op.rs` and one file a layer; loops in `kernels` |
 //! | what the latent found of the context, and what there was to find | [`train::probe`], `docs/identification.md` |

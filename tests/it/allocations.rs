@@ -7,8 +7,8 @@ use ada_diffuser::model::{
     config::{ModelConfig, Restart},
     critic::{Given, Sizes, Value},
     method::{
-        Actions, Backbone, Baseline, Diffused, GruLatent, Guide, Head, History, Inverse, LatentSource, Looks, Schedule, Target, Told,
-        TrueFuture,
+        Actions, Backbone, Baseline, Decoding, Diffused, GruLatent, Guide, Head, History, Inverse, LatentSource, Looks, Schedule, Target,
+        Told, TrueFuture,
     },
     nn::{Activations, Buffer, Params, Traced, gradient},
     normalizer::Affine,
@@ -152,6 +152,16 @@ fn ticks_of_other_methods_allocate_nothing() {
         (config.trained.action_horizons, config.trained.refined) = (vec![1], false);
         (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
     });
+    let actor = Backbone::Mlp { width: 16, depth: 2, dropout: 0.0 };
+    let skilled = agent_with(latent.clone(), actor, 2, |config| {
+        config.method.latent = LatentSource::None;
+        (config.method.plan.diffused, config.method.plan.horizon) = (Diffused::Code { dim: 4, steps: 3 }, 1);
+        config.method.plan.schedule = Schedule::Uniform { steps: 5 };
+        config.method.head = Head::Skill { width: 8, layers: 1, action: Decoding::Autoregressive };
+        (config.method.guide, config.units.returns) = (Some(Guide::Critic { width: 8 }), Some(Affine::identity(1)));
+        (config.trained.action_horizons, config.trained.refined) = (vec![1], false);
+        (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
+    });
     for (agent, told, context) in [
         (guided(Guide::Value { widths: vec![8, 16] }), false, None),
         (guided(Guide::DecoderReturn), false, None),
@@ -159,6 +169,7 @@ fn ticks_of_other_methods_allocate_nothing() {
         (of_states, true, None),
         (policy, false, None),
         (chosen, false, None),
+        (skilled, false, None),
         (oracle, false, Some(vec![vec![0.3, 0.4]])),
     ] {
         let (config, guide) = (agent.config(), agent.config().method.guide.as_ref());

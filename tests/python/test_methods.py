@@ -32,6 +32,10 @@ TINY = [
     "stages.denoise.learning_rate.warm_up=1",
     "checkpoint_every=100",
 ]
+TINY_SKILLS = [
+    *(f"stages.{stage}.{key}" for stage in ("skills", "values") for key in ("steps=4", "learning_rate.warm_up=1")),
+    "losses.double_q.candidates=2",
+]
 TINY_LATENT = ["losses.elbo.batch=4", "stages.identify.steps=4", "stages.identify.learning_rate.warm_up=1", "stages.identify.gate="]
 
 
@@ -45,7 +49,7 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
         name = method.stem if method else "plain"
         text = method.read_text(encoding="utf-8") if method else ""
         network = next(network for kind, network in TINY_NETWORKS.items() if f'backbone" = {{ kind = "{kind}' in text or not kind)
-        keys = [network, *TINY, *([] if 'stages.identify"' in text else TINY_LATENT)]
+        keys = [network, *TINY, *([] if '"losses.elbo"' in text else TINY_LATENT), *(TINY_SKILLS if "losses.skill" in text else [])]
         words = [word for key in keys for word in ("--set", key)]
         chosen = ["--with", str(method)] if method else []
         command = [str(TRAINER), "run", str(RECIPE), "--data", str(data), "--out", str(folder / "models" / name), *chosen, *words]
@@ -93,6 +97,10 @@ def test_what_a_method_takes_is_told(address: str) -> None:
         with client.open_session("guided", seed=1, options=SamplerOptions(**cold, candidates=8, temperature=1.0)) as session:
             chunk = session.act(np.zeros(4, np.float32))
             assert chunk.value is not None and chunk.value_spread > 0.0 and chunk.evaluations == 8 * chunk.passes
+        with client.open_session("ldcq", seed=1) as session:
+            chunks = [session.act(np.zeros(4, np.float32)) for _ in range(11)]
+            assert [chunk.evaluations for chunk in chunks] == [640, *([0] * 9), 640], "a skill lasts for ten steps"
+            assert [chunk.value is None for chunk in chunks] == [False, *([True] * 9), False]
         told = {scale: act("told-return", SamplerOptions(**cold, told_return=-0.1, free_guidance_scale=scale)) for scale in (0.0, 1.0, 3.0)}
         assert not np.array_equal(told[0.0], told[1.0]) and not np.array_equal(told[1.0], told[3.0])
         goals = [act("told-goal", SamplerOptions(**cold, told_goal=goal)) for goal in ((-1.0, 0.0), (1.0, 0.0))]

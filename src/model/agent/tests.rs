@@ -16,6 +16,7 @@ mod executed;
 mod guidance;
 mod methods;
 mod running;
+mod skills;
 mod trained;
 
 const HORIZON: usize = 8;

@@ -111,7 +111,7 @@ pub struct Chunk {
 pub enum Start {
     /// From pure noise.
     Cold,
-    /// From the window of the act before, as it was.
+    /// From the window of the act before, as it was; or the skill of an act before goes on.
     Warm,
     /// From the window of the act before, noised again by this many rungs.
     Renoised(u32),
