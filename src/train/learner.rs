@@ -174,7 +174,7 @@ mod tests {
     use super::*;
     use crate::{
         model::{
-            method::{Baseline, Guide, Head, Inverse, LatentSource},
+            method::{Baseline, Decoding, Diffused, Guide, Head, Inverse, LatentSource},
             trajectory::Layout,
         },
         train::tests::recipe_with,
@@ -195,6 +195,12 @@ mod tests {
             Networks::new(config.layout, &config.method, &params).unwrap();
             groups.extend(params.vars().keys().map(|name| Group::of(name).unwrap_or_else(|| panic!("{name}"))));
         }
+        let params = Params::fresh(0);
+        recipe.model.latent = LatentSource::None;
+        recipe.model.plan.diffused = Diffused::Code { dim: 2, steps: 3 };
+        recipe.model.head = Head::Skill { width: 4, layers: 1, action: Decoding::Normal };
+        Networks::new(Layout { state_dim: 3, action_dim: 2 }, &recipe.model, &params).unwrap();
+        groups.extend(params.vars().keys().map(|name| Group::of(name).unwrap_or_else(|| panic!("{name}"))));
         assert_eq!(groups, Group::ALL.into_iter().collect());
     }
 }

@@ -86,7 +86,7 @@ mod tests {
         };
         let number = |tensor: &Tensor, row: usize| f64::from(tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap()[row]);
         let (mut expected, mut differ) = (0.0, false);
-        for row in 0..rows {
+        for (row, distance) in distances.iter().enumerate() {
             let lesser = |critic: &Critic, at: usize| {
                 let [a, b] = pair(critic, &one(&next_state, row, 0), &one(&next_codes, row, at));
                 a.min(b)
@@ -97,7 +97,7 @@ mod tests {
             let aim = number(&reward, row) + keeps * later;
             let off = pair(&critic, &one(&state, row, 0), &one(&code, row, 0)).map(|q| q - aim);
             expected += number(&weight, row) * off.iter().map(|off| off * off).sum::<f64>() / rows as f64;
-            assert!((f64::from(distances[row]) - (off[0].abs() + off[1].abs()) / 2.0).abs() < 1e-5);
+            assert!((f64::from(*distance) - (off[0].abs() + off[1].abs()) / 2.0).abs() < 1e-5);
         }
         assert!((f64::from(loss.to_scalar::<f32>().unwrap()) - expected).abs() < 1e-5);
         assert!(differ, "the best to one copy is not the best to the other, or the test tells nothing");

@@ -51,6 +51,17 @@ struct Offers<'a> {
     codes: Vec<f32>,
 }
 
+/// Some of the places, as a step looks at them.
+struct Replay {
+    /// Which.
+    drawn: Vec<usize>,
+    batch: SkillBatch,
+    /// How much each counts.
+    weights: Vec<f32>,
+    /// `(places, candidates, code_dim)` what is offered after each.
+    next_codes: Vec<f32>,
+}
+
 impl<'a> Offers<'a> {
     fn new(episodes: &'a [Episode], steps: usize, most: usize) -> Self {
         let all = skill_places(episodes, steps);
@@ -127,11 +138,10 @@ impl<'a> DoubleQLoss<'a> {
     /// If an episode cannot be read.
     pub(super) fn job<'b>(&'b self, networks: &'b Networks, target: &'b Critic, priorities: &[f32], rng: &mut Philox) -> Result<Job<'b>> {
         let (drawn, weights) = replayed(priorities, self.config, rng);
-        let places: Vec<_> = drawn.iter().map(|index| self.train.places[*index]).collect();
-        let batch = skills(self.train.episodes, &places, &self.shape, rng)?;
+        let replay = self.look_at(&self.train, drawn, weights, rng)?;
         Ok(Box::new(move || {
-            let (loss, off) = self.errors(networks, target, (&self.train, &drawn), &batch, &weights)?;
-            let off = drawn.iter().zip(off).map(|(index, off)| (*index, off + LEAST_PRIORITY)).collect();
+            let (loss, off) = self.errors(networks, target, &replay)?;
+            let off = replay.drawn.iter().zip(off).map(|(index, off)| (*index, off + LEAST_PRIORITY)).collect();
             Ok(Part { off, ..Part::of(&loss, self.weight, vec![Mean::of("double_q", &loss)?])? })
         }))
     }
@@ -141,24 +151,23 @@ impl<'a> DoubleQLoss<'a> {
     /// # Errors
     /// If a tensor operation fails.
     pub fn held_out(&self, networks: &Networks) -> Result<f64> {
-        let all: Vec<usize> = (0..self.held_out.places.len()).collect();
-        let batch = skills(self.held_out.episodes, &self.held_out.places, &self.shape, &mut Philox::new(HELD_OUT_SEED))?;
-        let critic = networks.critic.as_ref().context(NO_CRITIC)?;
-        let (loss, _) = self.errors(networks, critic, (&self.held_out, &all), &batch, &vec![1.0; all.len()])?;
+        let all = self.held_out.places.len();
+        let replay = self.look_at(&self.held_out, (0..all).collect(), vec![1.0; all], &mut Philox::new(HELD_OUT_SEED))?;
+        let (loss, _) = self.errors(networks, networks.critic.as_ref().context(NO_CRITIC)?, &replay)?;
         Ok(f64::from(loss.to_scalar::<f32>()?))
     }
 
-    fn errors(
-        &self,
-        networks: &Networks,
-        target: &Critic,
-        (offers, drawn): (&Offers, &[usize]),
-        batch: &SkillBatch,
-        weights: &[f32],
-    ) -> Result<(Tensor, Vec<f32>)> {
+    fn look_at(&self, offers: &Offers, drawn: Vec<usize>, weights: Vec<f32>, rng: &mut Philox) -> Result<Replay> {
+        let places: Vec<_> = drawn.iter().map(|index| offers.places[*index]).collect();
+        let size = self.config.candidates * self.task.config.method.plan.diffused.code_dim();
+        let next_codes = drawn.iter().flat_map(|index| &offers.codes[index * size..][..size]).copied().collect();
+        Ok(Replay { batch: skills(offers.episodes, &places, &self.shape, rng)?, drawn, weights, next_codes })
+    }
+
+    fn errors(&self, networks: &Networks, target: &Critic, replay: &Replay) -> Result<(Tensor, Vec<f32>)> {
         let (critic, skill) = (networks.critic.as_ref().context(NO_CRITIC)?, networks.skill.as_ref().context(NO_SKILL)?);
+        let Replay { drawn, batch, weights, next_codes } = replay;
         let (rows, dim, each) = (drawn.len(), self.task.config.method.plan.diffused.code_dim(), self.config.candidates);
-        let next: Vec<f32> = drawn.iter().flat_map(|index| &offers.codes[index * each * dim..][..each * dim]).copied().collect();
         let column = |values: Vec<f32>| Tensor::from_vec(values, (rows, 1, 1), &Device::Cpu);
         let (worth, discount) = (Worth::of(self.task), f64::from(self.task.config.method.discount));
         let steps = batch.rewards.len() / rows.max(1);
@@ -171,7 +180,7 @@ impl<'a> DoubleQLoss<'a> {
             code: &skill.codes(&batch.segments)?,
             reward: &column(batch.rewards.chunks_exact(steps).map(own).collect())?,
             next_state: &batch.next_state,
-            next_codes: &Tensor::from_vec(next, (rows, each, dim), &Device::Cpu)?,
+            next_codes: &Tensor::from_slice(next_codes, (rows, each, dim), &Device::Cpu)?,
             ended: &column(batch.ended.iter().map(|ended| f32::from(*ended)).collect())?,
             end_worth: worth.of_raw(0.0),
             weight: &column(weights.to_vec())?,

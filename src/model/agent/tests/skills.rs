@@ -30,7 +30,7 @@ fn a_skill_lasts() {
         let agent = of_skills(action);
         let chunks = run(&agent, 1, &skilled(8), 9);
         for (i, chunk) in chunks.iter().enumerate() {
-            let begins = i as u64 % SKILL_STEPS == 0;
+            let begins = (i as u64).is_multiple_of(SKILL_STEPS);
             assert_eq!((chunk.evaluations, chunk.passes), if begins { (8 * 6, 6) } else { (0, 0) }, "act {i}");
             assert_eq!((chunk.start, chunk.value.is_some()), (if begins { Start::Cold } else { Start::Warm }, begins));
             assert!(chunk.actions.len() == 1 && chunk.planned_states.is_empty() && !chunk.degraded);
