@@ -205,21 +205,22 @@ pub fn skill_places(episodes: &[Episode], steps: usize) -> Vec<(usize, usize)> {
     episodes.iter().enumerate().flat_map(of).collect()
 }
 
-/// What came of the skills at places of [`skill_places`].
+/// What came of the skills at places of [`skill_places`], of so many steps; their codes will be so wide.
 ///
 /// # Errors
 /// If an episode cannot be read.
-pub fn skills(episodes: &[Episode], places: &[(usize, usize)], shape: &WindowShape, rng: &mut Philox) -> Result<SkillBatch> {
-    let (steps, dim) = (shape.plan.diffused.code_steps().unwrap_or(1), shape.plan.diffused.code_dim());
-    let (mut rewards, mut ended, mut states, mut drawn) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-    for (episode, start) in places.iter().map(|(episode, start)| (&episodes[*episode], *start)) {
+pub fn skills(episodes: &[Episode], places: &[(usize, usize)], [steps, dim]: [usize; 2], rng: &mut Philox) -> Result<SkillBatch> {
+    let (mut rewards, mut ended, mut states) = (Vec::new(), Vec::new(), Vec::new());
+    let places = || places.iter().map(|(episode, start)| (&episodes[*episode], *start));
+    for (episode, start) in places() {
         (start..start + steps).try_for_each(|t| episode.reward(t).map(|reward| rewards.push(reward)))?;
         ended.push(start + steps == episode.len());
         states.extend_from_slice(&episode.state((start + steps).min(episode.len() - 1))?);
-        drawn.push(shape.at((episode.clone(), start as isize), (Standing::Row(0), 0), rng));
     }
-    let segments = segments(&drawn, steps, gaussian((places.len(), 1, dim), rng)?)?;
-    let next_state = Tensor::from_vec(states, (places.len(), 1, episodes[0].layout.state_dim), &Device::Cpu)?;
+    let count = ended.len();
+    let begins = places().map(|(episode, start)| (episode, start as isize));
+    let segments = segments(begins, steps, gaussian((count, 1, dim), rng)?)?;
+    let next_state = Tensor::from_vec(states, (count, 1, episodes[0].layout.state_dim), &Device::Cpu)?;
     Ok(SkillBatch { segments, rewards, ended, next_state })
 }
 
@@ -254,7 +255,8 @@ fn cut(drawn: &[Drawn], shape: &WindowShape, rng: &mut Philox) -> Result<WindowB
     let coded = shape.plan.diffused.code_steps();
     let noise_dims = coded.map_or(dims, |_| (shape.batch, horizon, shape.plan.diffused.code_dim()));
     let noise = gaussian(noise_dims, rng)?;
-    let segments = coded.map(|steps| segments(drawn, steps, gaussian(noise_dims, rng)?)).transpose()?;
+    let places = drawn.iter().map(|drawn| (&drawn.episode, drawn.start));
+    let segments = coded.map(|steps| segments(places, steps, gaussian(noise_dims, rng)?)).transpose()?;
     let places = drawn.iter().map(|drawn| (&drawn.episode, drawn.start.unsigned_abs(), drawn.imagined));
     let BesideBatch { told, truth, returns } = shape.beside.of(places, horizon, rng)?;
     let chance = (shape.plan.backbone.dropout() > 0.0).then(|| u64::from(rng.bits()) << 32 | u64::from(rng.bits()));
@@ -284,13 +286,13 @@ fn gaussian(dims: (usize, usize, usize), rng: &mut Philox) -> Result<Tensor> {
 }
 
 /// What is done in so many steps from the places on; `eps` draws the codes.
-fn segments(drawn: &[Drawn], steps: usize, eps: Tensor) -> Result<Segments> {
-    let mut all = Vec::new();
-    for Drawn { episode, start, .. } in drawn {
-        (*start..*start + steps as isize).try_for_each(|t| push_step(&mut all, episode, t, Seen::ALL))?;
+fn segments<'a>(places: impl Iterator<Item = (&'a Episode, isize)>, steps: usize, eps: Tensor) -> Result<Segments> {
+    let (mut all, mut width) = (Vec::new(), 0);
+    for (episode, start) in places {
+        width = episode.layout.dim();
+        (start..start + steps as isize).try_for_each(|t| push_step(&mut all, episode, t, Seen::ALL))?;
     }
-    let dims = (drawn.len(), steps, drawn[0].episode.layout.dim());
-    Ok(Segments { steps: Tensor::from_vec(all, dims, &Device::Cpu)?, eps })
+    Ok(Segments { steps: Tensor::from_vec(all, (eps.dim(0)?, steps, width), &Device::Cpu)?, eps })
 }
 
 #[cfg(test)]

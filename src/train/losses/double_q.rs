@@ -159,9 +159,10 @@ impl<'a> DoubleQLoss<'a> {
 
     fn look_at(&self, offers: &Offers, drawn: Vec<usize>, weights: Vec<f32>, rng: &mut Philox) -> Result<Replay> {
         let places: Vec<_> = drawn.iter().map(|index| offers.places[*index]).collect();
-        let size = self.config.candidates * self.task.config.method.plan.diffused.code_dim();
+        let (steps, dim) = (self.shape.plan.diffused.code_steps().unwrap_or(1), self.shape.plan.diffused.code_dim());
+        let size = self.config.candidates * dim;
         let next_codes = drawn.iter().flat_map(|index| &offers.codes[index * size..][..size]).copied().collect();
-        Ok(Replay { batch: skills(offers.episodes, &places, &self.shape, rng)?, drawn, weights, next_codes })
+        Ok(Replay { batch: skills(offers.episodes, &places, [steps, dim], rng)?, drawn, weights, next_codes })
     }
 
     fn errors(&self, networks: &Networks, target: &Critic, replay: &Replay) -> Result<(Tensor, Vec<f32>)> {
