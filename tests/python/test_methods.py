@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from server import ROOT, running
 
-from ada_diffuser import Client, InvalidInput, SamplerOptions
+from ada_diffuser import Client, Executed, InvalidInput, SamplerOptions
 from ada_diffuser.commands.collect import main as collect
 from ada_diffuser.rollout import Trial, evaluate
+from ada_diffuser.rollout.warm_start import WarmStart
 
 TRAINER = Path(os.environ.get("ADA_TRAINER", ROOT / "target/release/ada-trainer"))
 RECIPE = ROOT / "models/point-wind-s/recipe.toml"

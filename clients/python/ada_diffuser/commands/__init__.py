@@ -45,12 +45,15 @@ def add_trial_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def warm_start(arguments: argparse.Namespace) -> WarmStart | None:
-    """What `--warm-start` names, read. Raises `ValueError` or `OSError`, before a server is waited for."""
+    """What `--warm-start` names, read. Raises `ValueError`, before a server is waited for."""
     if arguments.warm_start is None:
         return None
     from ada_diffuser.rollout.warm_start import WarmStart
 
-    return WarmStart.parse(arguments.warm_start)
+    try:
+        return WarmStart.parse(arguments.warm_start)
+    except (OSError, KeyError) as error:
+        raise ValueError(f"--warm-start {arguments.warm_start}: is no data set of ada-collect: {error}") from None
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:

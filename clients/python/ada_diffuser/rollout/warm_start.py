@@ -31,7 +31,7 @@ class WarmStart:
     def parse(cls, word: str) -> WarmStart:
         """`FILE` or `FILE:EPISODE`; negative episodes count from the end, and without one it is the last.
 
-        Raises `ValueError` for a file without the arrays of a data set, or without that episode, and `OSError` for one that cannot be read.
+        Raises `ValueError` for an episode that the file has not, and `OSError` or `KeyError` for a file that is no data set.
         """
         name, colon, number = word.rpartition(":")
         if not colon or Path(word).exists():
@@ -47,9 +47,6 @@ class WarmStart:
     def load(cls, path: Path, episode: int = -1) -> WarmStart:
         """See `parse`."""
         with h5py.File(path, "r") as file:
-            missing = [PATHS[name] for name in ("observations", "actions", "rewards", "terminals", "timeouts") if PATHS[name] not in file]
-            if missing:
-                raise ValueError(f"{path} is no data set as docs/data.md has it: it has no {' and no '.join(missing)}")
             ends = np.flatnonzero(file[PATHS["terminals"]][()].astype(bool) | file[PATHS["timeouts"]][()].astype(bool)) + 1
             if not -len(ends) <= episode < len(ends):
                 raise ValueError(f"{path} has {len(ends)} episodes, and none with the number {episode}")
