@@ -61,6 +61,7 @@
 //! | what the latent found of the context, and what there was to find | [`train::probe`], `docs/identification.md` |
 //! | what is minimized, and which networks move | [`train::recipe::stages`], [`train::recipe::losses`] |
 //! | which episodes a loss draws from; a batch cut from them, over the border of a session too | [`train::dataset::Which`], [`train::dataset::window`] |
+//! | what was executed, as tokens; a history that outlasts an episode, or is brought along | `model/agent/executed.rs`, [`model::agent::Agent::recall`] |
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
 //! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |
 //!

@@ -76,7 +76,9 @@ impl Episode {
     pub(super) fn reset(&self, seed: u64, keep_history: bool) -> Self {
         let mut fresh = Self::new(seed, self.options.clone(), self.memory.len());
         if keep_history {
-            fresh.history.clone_from(&self.history);
+            // Room for the border too: what grows by one takes twice as much, and a history that waits to be read may be long.
+            fresh.history.reserve_exact(self.history.len() + 1);
+            fresh.history.extend(self.history.iter().cloned());
             fresh.memory.clone_from(&self.memory);
             fresh.unread = self.unread;
             // Where nothing was lived there is no border, however often it is reset.

@@ -15,6 +15,7 @@ use crate::model::{
 mod executed;
 mod guidance;
 mod methods;
+mod recall;
 mod running;
 mod skills;
 mod trained;
