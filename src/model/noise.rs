@@ -32,8 +32,8 @@ pub enum Slot {
     Renoise = 3,
     /// The epsilon of a latent.
     Latent = 4,
-    /// An action that a plan has none of: by inverse dynamics at pure noise and on its way down, or by a skill.
-    Decode = 6,
+    /// Inverse dynamics: an action at pure noise, and its way down.
+    Inverse = 6,
     /// The choice among candidates.
     Choice = 7,
     /// A future of Monte Carlo guidance.

@@ -186,21 +186,17 @@ impl Agent {
         let latents = inverse.sees_latent().then(|| rows::gather(rows(), [1, dim], latent)).transpose()?;
         let draw = |level: u32, scale: f32, out: &mut [f32]| {
             let rows = rows().zip(out.chunks_exact_mut(layout.action_dim));
-            rows.for_each(|(row, out)| row.window().draw_action(level, scale, row.act().options().temperature, out));
+            rows.for_each(|(row, out)| row.window().draw_inverse(level, scale, row.act().options().temperature, out));
         };
         inverse.sample(self.inverse_process(), (&states, latents.as_ref()), layout.action_dim, draw)
     }
 
-    /// What codes say is to be done in the states of now. The noise is that of the first candidate, whichever was chosen: a skill goes on as it
-    /// began.
+    /// What codes say is to be done in the states of now.
     fn by_codes(&self, skill: &Skills, acts: &[Act]) -> Result<Buffer> {
-        let (layout, width) = (self.config().layout, self.walk().columns.width());
         let gather = |width: usize, write: &dyn Fn(Row, &mut [f32])| rows::gather(asking(acts, Ask::Decode), [1, width], write);
-        let state = gather(layout.state_dim, &|row, out| out.copy_from_slice(row.window().descent().known()))?;
-        let code = gather(width, &|row, out| out.copy_from_slice(row.window().descent().given(0)))?;
-        let noise =
-            gather(layout.action_dim, &|row, out| row.act().candidates()[0].draw_action(0, 1.0, row.act().options().temperature, out))?;
-        skill.act(&state, &code, &noise)
+        let state = gather(self.config().layout.state_dim, &|row, out| out.copy_from_slice(row.window().descent().known()))?;
+        let code = gather(self.walk().columns.width(), &|row, out| out.copy_from_slice(row.window().descent().given(0)))?;
+        skill.act(&state, &code)
     }
 
     /// Numbers of a window.

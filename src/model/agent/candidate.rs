@@ -171,9 +171,9 @@ impl Candidate {
         self.descent.time() - (self.descent.given_len() - self.actions_len()) as u64
     }
 
-    /// Noise of the next action at a level, of this standard deviation.
-    pub(super) fn draw_action(&self, level: u32, scale: f32, temperature: f32, out: &mut [f32]) {
-        self.descent.noise().fill(self.action_time(), level, Slot::Decode, out);
+    /// Noise of the next action at a level of inverse dynamics, of this standard deviation.
+    pub(super) fn draw_inverse(&self, level: u32, scale: f32, temperature: f32, out: &mut [f32]) {
+        self.descent.noise().fill(self.action_time(), level, Slot::Inverse, out);
         out.iter_mut().for_each(|out| *out *= scale * temperature);
     }
 
