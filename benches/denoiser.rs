@@ -171,6 +171,7 @@ fn train_step(c: &mut Criterion) {
             noise: random([batch_size, T, STATE + ACTION]),
             told: None,
             truth: None,
+            segments: None,
             returns: None,
             chance: None,
         };

@@ -55,11 +55,13 @@
 //! | several rows of the table at once (Picard iteration) | [`model::diffusion::picard`] |
 //! | what a window is worth, and the way to better ones | [`model::critic::Value`], [`model::diffusion::guidance`], [`model::nn::gradient()`] |
 //! | actions of a plan of states | [`model::head::InverseDynamics`], [`model::diffusion::inverse`] |
+//! | a skill: what its code stands for, and what it is worth | [`model::head::Skills`], [`model::critic::SkillTransitions`] |
 //! | blocks that networks over windows share | [`model::temporal`] |
 //! | a layer: its shape, forward and backward | [`model::nn`], `op.rs` and one file a layer; loops in `kernels` |
 //! | what the latent found of the context, and what there was to find | [`train::probe`], `docs/identification.md` |
 //! | what is minimized, and which networks move | [`train::recipe::stages`], [`train::recipe::losses`] |
 //! | which episodes a loss draws from; a batch cut from them, over the border of a session too | [`train::dataset::Which`], [`train::dataset::window`] |
+//! | what was executed, as tokens; a history that outlasts an episode, or is brought along | `model/agent/executed.rs`, [`model::agent::Agent::recall`] |
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
 //! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |
 //!

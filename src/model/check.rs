@@ -26,6 +26,8 @@ const COLUMNS_MAX: usize = 4096;
 /// Numbers in all networks, and tensors that hold them: within the loader's bounds on the weight file and the manifest.
 const PARAMETERS_MAX: usize = 1 << 27;
 const TENSORS_MAX: usize = 2048;
+/// Layers of an encoder of skills.
+const LAYERS_MAX: usize = 64;
 /// Evaluations of inverse dynamics for one action.
 const INVERSE_STEPS_MAX: usize = 1000;
 /// Factor on the noise.
@@ -186,6 +188,7 @@ impl ModelConfig {
             Schedule::Uniform { steps } => size("method.plan.schedule.steps", *steps, *level_max)?,
         }
         check_head(*diffused, head, latent)?;
+        self.check_code(*diffused)?;
         check_guide(guide.as_ref(), plan, latent)?;
         self.check_kinds_told(told)?;
         require((0.0..1.0).contains(discount), "method.discount", format!("is {discount}, must lie in 0..1"))?;
@@ -224,6 +227,28 @@ impl ModelConfig {
         require(clip.is_finite() && *clip > 0.0, "method.plan.clip", format!("is {clip}, must be positive and finite"))
     }
 
+    /// A code is a window of one position, and what is done by it is asked state by state.
+    fn check_code(&self, diffused: Diffused) -> Result<(), Unfit> {
+        if diffused.code_steps().is_none() {
+            return Ok(());
+        }
+        let Diffusion { horizon, schedule, .. } = &self.method.plan;
+        require(
+            *horizon == 1,
+            "method.plan.horizon",
+            format!("is {horizon}, must be 1 where a code is diffused, which is one for all steps"),
+        )?;
+        require(
+            !schedule.is_ladder(),
+            "method.plan.schedule",
+            "must be uniform where a code is diffused: no second position comes clean behind it",
+        )?;
+        let tells = "must be empty where a code is diffused: decoder and critics would not know of it";
+        require(self.method.told.is_empty(), "method.told", tells)?;
+        let reason = "of a model whose plan is a code must be [1]: what is done by it depends on the state of each step";
+        require(self.trained.action_horizons == [1], "trained.action_horizons", reason)
+    }
+
     fn check_kinds_told(&self, told: &[Told]) -> Result<(), Unfit> {
         let alike = |a: &Told, b: &Told| std::mem::discriminant(a) == std::mem::discriminant(b);
         let twice = told.iter().enumerate().any(|(i, a)| told[..i].iter().any(|b| alike(a, b)));
@@ -259,11 +284,25 @@ impl ModelConfig {
 fn check_head(diffused: Diffused, head: &Head, latent: &LatentSource) -> Result<(), Unfit> {
     match (diffused, head) {
         (Diffused::StateAction | Diffused::Action, Head::Direct) => Ok(()),
-        (Diffused::StateAction | Diffused::Action, Head::Inverse { .. }) => {
+        (Diffused::StateAction | Diffused::Action, Head::Inverse { .. } | Head::Skill { .. }) => {
             require(false, "method.head", "must be direct where actions are diffused: they are there already")
         }
-        (Diffused::State, Head::Direct) => {
+        (Diffused::State, Head::Direct | Head::Skill { .. }) => {
             require(false, "method.head", "must be inverse where states alone are diffused: nothing else makes actions of them")
+        }
+        (Diffused::Code { .. }, Head::Direct | Head::Inverse { .. }) => {
+            require(false, "method.head", "must be skill where a code is diffused: nothing else makes actions of it")
+        }
+        (Diffused::Code { dim, steps }, Head::Skill { width, layers, action: _ }) => {
+            size("method.plan.diffused.code.dim", dim, WIDTH_MAX)?;
+            size("method.plan.diffused.code.steps", steps, HORIZON_MAX)?;
+            size("method.head.width", *width, WIDTH_MAX)?;
+            size("method.head.layers", *layers, LAYERS_MAX)?;
+            require(
+                *latent == LatentSource::None,
+                "method.latent",
+                "must be none where a code is diffused: the encoder of skills sees no latent",
+            )
         }
         (Diffused::State, Head::Inverse { network, latent: sees }) => {
             match network {
@@ -282,13 +321,13 @@ fn check_guide(guide: Option<&Guide>, plan: &Diffusion, latent: &LatentSource) -
     match guide {
         None => Ok(()),
         Some(Guide::Value { widths }) => {
-            let sees = plan.diffused != Diffused::Action;
+            let sees = plan.diffused.has_states();
             require(sees, "method.guide", "value needs windows with states: actions alone do not say where they are taken")?;
             check_value(widths, plan.horizon)
         }
         Some(Guide::Critic { width }) => {
             let acts = plan.diffused != Diffused::State;
-            require(acts, "method.guide", "critic needs windows with actions, of which it judges the first")?;
+            require(acts, "method.guide", "critic needs windows with actions, of which it judges the first, or of codes")?;
             size("method.guide.width", *width, WIDTH_MAX)
         }
         Some(guide @ (Guide::DecoderReturn | Guide::Dual { .. })) => {

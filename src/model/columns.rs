@@ -10,7 +10,9 @@ pub struct Columns {
     pub state: Range<usize>,
     /// a_t; none where states alone are diffused.
     pub action: Range<usize>,
-    /// Which columns of a whole step, state and action side by side, these are.
+    /// The code of a skill, where that is diffused in place of steps.
+    pub code: Range<usize>,
+    /// Which columns of a whole step, state and action side by side, these are; of a code none.
     pub of_step: Range<usize>,
 }
 
@@ -22,8 +24,10 @@ impl Columns {
             Diffused::StateAction => (state_dim, action_dim, 0),
             Diffused::State => (state_dim, 0, 0),
             Diffused::Action => (0, action_dim, state_dim),
+            Diffused::Code { .. } => (0, 0, 0),
         };
-        Self { state: 0..states, action: states..states + actions, of_step: first..first + states + actions }
+        let steps = states + actions;
+        Self { state: 0..states, action: states..steps, code: steps..steps + diffused.code_dim(), of_step: first..first + steps }
     }
 
     /// State and action side by side.
@@ -33,7 +37,7 @@ impl Columns {
 
     /// Columns of a position (D).
     pub fn width(&self) -> usize {
-        self.state.len() + self.action.len()
+        self.state.len() + self.action.len() + self.code.len()
     }
 
     /// What is known of a position before anything is denoised: of the first one the state, where it is `real` and not imagined. It is
@@ -51,7 +55,7 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    /// States within `clip` standard deviations, actions within their own bounds.
+    /// States within `clip` standard deviations, codes within as many units, actions within their own bounds.
     pub fn new(columns: &Columns, clip: f32, units: &Units) -> Self {
         let (mut low, mut high) = (vec![-clip; columns.width()], vec![clip; columns.width()]);
         let (action_low, action_high) = units.action_bounds();

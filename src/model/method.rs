@@ -55,20 +55,41 @@ pub enum Head {
         /// Whether they see the latent of the step.
         latent: bool,
     },
+    /// The plan is the code of a skill, which says what to do in each state of several steps (LDCQ, Venkatraman et al. 2024).
+    Skill {
+        /// Of the decoder's hidden layers, and of the encoder's GRUs in either direction.
+        width: usize,
+        /// Layers of the encoder.
+        layers: usize,
+        /// How the columns of an action hang together.
+        #[serde(default)]
+        action: Decoding,
+    },
+}
+
+/// How the columns of an action, given the state and the code, hang together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Decoding {
+    /// Each is a Gaussian that knows those before it: by and by they are whatever the data's are.
+    #[default]
+    Autoregressive,
+    /// Each is a Gaussian by itself.
+    Normal,
 }
 
 impl Head {
     /// Levels of its diffusion, if it is one.
     pub fn level_max(&self) -> Option<usize> {
         match self {
-            Self::Direct | Self::Inverse { network: Inverse::Mlp { .. }, .. } => None,
+            Self::Direct | Self::Skill { .. } | Self::Inverse { network: Inverse::Mlp { .. }, .. } => None,
             Self::Inverse { network: Inverse::Diffusion { steps, .. }, .. } => Some(*steps),
         }
     }
 
     /// Whether actions are found by inverse dynamics.
     pub fn is_inverse(&self) -> bool {
-        !self.is_direct()
+        matches!(self, Self::Inverse { .. })
     }
 
     fn is_direct(&self) -> bool {
@@ -112,7 +133,8 @@ pub enum Guide {
         discrepancy: f32,
     },
     /// Critics of the first action, learned from what came of actions (implicit Q-learning, Kostrikov et al. 2022; as IDQL, Hansen-Estruch et
-    /// al. 2023, they choose among candidates and lead none).
+    /// al. 2023, they choose among candidates and lead none). Of a skill they judge its code, and learn by double Q-learning over the steps that it
+    /// stands for (LDCQ, Venkatraman et al. 2024).
     Critic {
         /// Of two hidden layers.
         width: usize,

@@ -1,9 +1,9 @@
 //! The networks of one model under one parameter store.
 
 use crate::model::{
-    critic::{Critic, Sizes, Value},
+    critic::{Critic, Judged, Sizes, Value},
     denoiser::Denoiser,
-    head::InverseDynamics,
+    head::{InverseDynamics, Skills},
     latent::LatentModel,
     method::{Diffusion, Guide, Method},
     nn::params::Params,
@@ -19,6 +19,8 @@ pub struct Networks {
     pub denoiser: Denoiser,
     /// What makes actions of a plan of states; none where they are part of it.
     pub inverse: Option<InverseDynamics>,
+    /// What makes actions of the code of a skill; none where nothing is coded.
+    pub skill: Option<Skills>,
     /// What tells the worth of windows, where that is a network.
     pub guide: Option<Value>,
     /// What tells the worth of actions, where that chooses.
@@ -26,7 +28,7 @@ pub struct Networks {
 }
 
 impl Networks {
-    /// Parameters `latent.*`, `denoiser.*`, `inverse.*`, `guide.*` and `critic.*`.
+    /// Parameters `latent.*`, `denoiser.*`, `inverse.*`, `skill.*`, `guide.*` and `critic.*`.
     ///
     /// # Errors
     /// If a loaded parameter is missing or of another shape, or sizes do not fit together.
@@ -47,6 +49,7 @@ impl Networks {
             latent: latent.transpose()?,
             denoiser: Denoiser::new(layout, method, &led.scope("denoiser"))?,
             inverse,
+            skill: Skills::new(layout, method, &params.scope("skill"))?,
             guide: value,
             critic: Self::critic(layout, method, params)?,
         })
@@ -58,6 +61,6 @@ impl Networks {
     /// As of [`Self::new`].
     pub fn critic(layout: Layout, method: &Method, params: &Params) -> Result<Option<Critic>> {
         let Some(Guide::Critic { width }) = &method.guide else { return Ok(None) };
-        Critic::new(layout, method.latent.dim(), *width, &params.scope("critic")).map(Some)
+        Critic::new(Judged::of(layout, method), *width, &params.scope("critic")).map(Some)
     }
 }

@@ -167,7 +167,8 @@ impl ServiceError {
         match error {
             AgentError::InvalidObservation { field, reason } => Self::invalid(format!("observation.{field}"), reason),
             AgentError::InvalidOptions { field, reason } => Self::invalid(format!("options.{field}"), reason),
-            error @ AgentError::HistoryNotKept => Self::invalid("keep_history", error.to_string()),
+            AgentError::InvalidHistory { field, reason } => Self::invalid(field, reason),
+            ref error @ AgentError::HistoryNotKept { field } => Self::invalid(field, error.to_string()),
             AgentError::NonFinite => {
                 let id = Uuid::new_v4();
                 tracing::error!(%id, "the network's output is not finite");

@@ -1,7 +1,7 @@
 //! What the faces hand to the service and get back, in the words of the domain.
 
 use crate::{
-    model::agent::Observation,
+    model::agent::{Executed, Observation},
     serve::{
         error::ServiceError,
         options::OptionsPatch,
@@ -52,6 +52,8 @@ pub struct OpenRequest {
     pub ttl_ms: Option<u64>,
     /// The client's name for this request; empty: none.
     pub request_id: String,
+    /// Steps lived before the session, oldest first, on which the latent looks back; see [`crate::model::agent::Agent::recall`].
+    pub history: Vec<Executed>,
 }
 
 /// A session that was opened.

@@ -159,14 +159,15 @@ impl Service {
     /// OpenSession.
     ///
     /// # Errors
-    /// `ModelNotFound`, `Invalid`, `Quota`, `NotReady`, `Draining`.
+    /// `ModelNotFound`, `Invalid`, `TooLarge`, `Quota`, `NotReady`, `Draining`.
     pub fn open(&self, request: OpenRequest) -> Result<Opened, ServiceError> {
-        let OpenRequest { model, seed, options, ttl_ms, request_id } = request;
+        let OpenRequest { model, seed, options, ttl_ms, request_id, history } = request;
         check_request_id(&request_id)?;
+        self.check_steps_told(history.len(), "number of steps of the history")?;
         let model = self.model(&model)?;
         let ttl = self.ttl(ttl_ms)?;
         let options = options.onto(&model.agent.spec().sampler);
-        let episode = model.agent.open(seed.unwrap_or_else(draw_seed), &options).map_err(ServiceError::from_agent)?;
+        let episode = model.agent.recall(seed.unwrap_or_else(draw_seed), &options, &history).map_err(ServiceError::from_agent)?;
         let is_named = !request_id.is_empty();
         let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, options, ttl, request_id };
         let now = Instant::now();
@@ -300,11 +301,8 @@ impl Service {
 
     async fn act_on(&self, session: &Arc<Session>, request: ActRequest, arrived: Instant) -> Result<Acted, ServiceError> {
         let ActRequest { step, episode, observation, deadline, timeout, want_planned_states, caller, .. } = request;
+        self.check_steps_told(observation.executed.len(), "number of executed steps")?;
         let limits = &self.config.limits;
-        if observation.executed.len() > limits.executed_len_max {
-            metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
-            return Err(ServiceError::TooLarge { what: "number of executed steps", limit: limits.executed_len_max });
-        }
         let longest = Duration::from_millis(limits.act_deadline_ms_max);
         let usual = Duration::from_millis(limits.act_deadline_ms);
         let patience = deadline.unwrap_or(usual).min(longest);
@@ -357,6 +355,16 @@ impl Service {
             Refusal::Closed => ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS },
         };
         job.ticket.session.fail(&job.ticket.flight, error);
+    }
+
+    /// What one request may tell of the past is bounded.
+    fn check_steps_told(&self, count: usize, what: &'static str) -> Result<(), ServiceError> {
+        let limit = self.config.limits.executed_len_max;
+        if count <= limit {
+            return Ok(());
+        }
+        metrics::counter!("ada_shed_total", "reason" => "TOO_LARGE").increment(1);
+        Err(ServiceError::TooLarge { what, limit })
     }
 
     fn registry(&self) -> Result<&Registry, ServiceError> {

@@ -62,6 +62,9 @@ impl Crank<'_> {
                 self.log.say(&format!("checkpoint in {}: {:#}", self.out.display(), product.metrics()));
                 return Ok(Outcome::Finished);
             }
+            if self.stage(learner).keeps == Keeps::Average {
+                learner.take_average()?;
+            }
             if let Some(Kept { step, score }) = learner.take_kept()? {
                 self.log.say(&format!("{} hands on the weights of step {step}, measured at {score:.4}", self.stage(learner).name));
             }
@@ -129,7 +132,7 @@ impl Crank<'_> {
     /// Weights of a stage that hands on its best ones are measured, and kept if they are.
     fn keep_if_best(&mut self, objective: &Objective, learner: &mut Learner) -> Result<()> {
         let score = match (self.stage(learner).keeps, &learner.networks.latent) {
-            (Keeps::Last, _) | (Keeps::LeastProbe(_), None) => None,
+            (Keeps::Last | Keeps::Average, _) | (Keeps::LeastProbe(_), None) => None,
             (Keeps::LeastHeldOut(_), _) => objective.score(&objective.held_out(&learner.networks)?),
             (Keeps::LeastProbe(_), Some(latent)) => Some(gate::probe(self.task, latent)?.filter),
         };

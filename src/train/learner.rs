@@ -5,7 +5,7 @@ use super::{
     optimizer::{Adam, Ema},
     position::Position,
     recipe::stages::{Group, Stage},
-    resume::{KEPT, Kept, Notes, Snapshot, State, restore_vars},
+    resume::{KEPT, Kept, Notes, PRIORITIES, Snapshot, State, restore_vars},
 };
 use crate::model::{Networks, critic::Critic, nn::params::Params};
 use anyhow::{Result, ensure};
@@ -30,6 +30,8 @@ pub struct Learner {
     pub ema: Option<Ema>,
     /// The best weights so far, of a stage that hands those on ([`Notes::kept`]); else none.
     kept: BTreeMap<String, Tensor>,
+    /// How far off what came of each skill was when it was last looked at, of a stage that draws by that; else none.
+    pub priorities: Vec<f32>,
     /// How far.
     pub position: Position,
     /// What the run has found out so far.
@@ -46,7 +48,7 @@ impl Learner {
         let networks = Networks::new(task.config.layout, &task.config.method, &params)?;
         let vars = params.vars();
         let (adam, ema) = equip(&task.recipe.stages[position.stage], &vars)?;
-        Ok(Self { networks, vars, adam, ema, kept: BTreeMap::new(), position, notes: Notes::default() })
+        Ok(Self { networks, vars, adam, ema, kept: BTreeMap::new(), priorities: Vec::new(), position, notes: Notes::default() })
     }
 
     /// The learner of a state on disk.
@@ -60,6 +62,9 @@ impl Learner {
         learner.adam.restore(&state.tensors, state.adam_steps)?;
         if let Some(ema) = &mut learner.ema {
             ema.restore(&state.tensors)?;
+        }
+        if let Some(priorities) = state.tensors.get(PRIORITIES) {
+            learner.priorities = priorities.to_vec1()?;
         }
         learner.notes = state.notes;
         let kept = state.tensors.into_iter().filter_map(|(name, tensor)| Some((name.strip_prefix(KEPT)?.to_string(), tensor)));
@@ -91,11 +96,21 @@ impl Learner {
         Ok(self.notes.kept.take())
     }
 
+    /// Takes up the average of the stage in the place of the weights.
+    ///
+    /// # Errors
+    /// If a tensor operation fails.
+    pub fn take_average(&mut self) -> Result<()> {
+        let Some(ema) = &self.ema else { return Ok(()) };
+        Ok(ema.tensors(&self.vars)?.iter().try_for_each(|(name, tensor)| self.vars[name].set(tensor))?)
+    }
+
     /// Goes on to the next stage with the weights as they are.
     ///
     /// # Errors
     /// If a tensor operation fails.
     pub fn enter_next(&mut self, task: &Task) -> Result<()> {
+        self.priorities = Vec::new();
         self.position = self.position.next_stage();
         (self.adam, self.ema) = equip(&task.recipe.stages[self.position.stage], &self.vars)?;
         Ok(())
@@ -120,6 +135,7 @@ impl Learner {
             adam: &self.adam,
             ema: self.ema.as_ref(),
             kept: &self.kept,
+            priorities: &self.priorities,
         }
     }
 
@@ -158,7 +174,7 @@ mod tests {
     use super::*;
     use crate::{
         model::{
-            method::{Baseline, Guide, Head, Inverse, LatentSource},
+            method::{Baseline, Decoding, Diffused, Guide, Head, Inverse, LatentSource},
             trajectory::Layout,
         },
         train::tests::recipe_with,
@@ -179,6 +195,12 @@ mod tests {
             Networks::new(config.layout, &config.method, &params).unwrap();
             groups.extend(params.vars().keys().map(|name| Group::of(name).unwrap_or_else(|| panic!("{name}"))));
         }
+        let params = Params::fresh(0);
+        recipe.model.latent = LatentSource::None;
+        recipe.model.plan.diffused = Diffused::Code { dim: 2, steps: 3 };
+        recipe.model.head = Head::Skill { width: 4, layers: 1, action: Decoding::Normal };
+        Networks::new(Layout { state_dim: 3, action_dim: 2 }, &recipe.model, &params).unwrap();
+        groups.extend(params.vars().keys().map(|name| Group::of(name).unwrap_or_else(|| panic!("{name}"))));
         assert_eq!(groups, Group::ALL.into_iter().collect());
     }
 }

@@ -27,6 +27,8 @@ pub mod ridge;
 #[cfg(test)]
 mod same_tests;
 mod ship;
+#[cfg(test)]
+mod skill_tests;
 pub mod tensorboard;
 #[cfg(test)]
 mod tests;

@@ -1,7 +1,7 @@
 //! The training state on disk: everything a run needs to go on with the same bits as if it had never stopped.
 //!
-//! Batches are a function of (seed, stage, attempt, step), so no generator has a state to keep: variables, Adam's moments, the EMA
-//! and the position are all there is.
+//! Batches are a function of (seed, stage, attempt, step), so no generator has a state to keep: variables, Adam's moments, the EMA,
+//! priorities of replay and the position are all there is.
 
 use super::{
     amend::{Change, amend},
@@ -22,6 +22,9 @@ const FILE: &str = "state.safetensors";
 const KEY: &str = "training";
 /// How names of weights begin that a stage will hand on.
 pub const KEPT: &str = "kept.";
+
+/// The tensor of [`super::learner::Learner::priorities`].
+pub const PRIORITIES: &str = "priorities";
 
 /// What a state belongs to.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -73,7 +76,7 @@ pub struct State {
     pub notes: Notes,
     /// Steps that the optimizer has counted.
     pub adam_steps: u64,
-    /// `var.NAME`, `m.NAME`, `v.NAME`, `ema.NAME`, `kept.NAME`.
+    /// `var.NAME`, `m.NAME`, `v.NAME`, `ema.NAME`, `kept.NAME`, `priorities`.
     pub tensors: BTreeMap<String, Tensor>,
 }
 
@@ -91,6 +94,8 @@ pub struct Snapshot<'a> {
     pub ema: Option<&'a Ema>,
     /// The best of them so far, of a stage that hands those on; [`Notes::kept`] tells which.
     pub kept: &'a BTreeMap<String, Tensor>,
+    /// See [`super::learner::Learner::priorities`].
+    pub priorities: &'a [f32],
 }
 
 /// The state of one run in its directory.
@@ -144,6 +149,9 @@ impl Store {
         tensors.extend(snapshot.kept.iter().map(|(name, tensor)| (format!("{KEPT}{name}"), tensor.clone())));
         if let Some(ema) = snapshot.ema {
             tensors.extend(ema.tensors(snapshot.vars)?.into_iter().map(|(name, tensor)| (format!("ema.{name}"), tensor)));
+        }
+        if !snapshot.priorities.is_empty() {
+            tensors.insert(PRIORITIES.into(), Tensor::from_slice(snapshot.priorities, snapshot.priorities.len(), &Device::Cpu)?);
         }
         let identity = Identity { recipe: self.recipe.to_toml(), dataset: self.dataset.clone() };
         let header = Header { identity, position: snapshot.position, adam_steps, notes: snapshot.notes.clone() };

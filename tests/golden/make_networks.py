@@ -495,6 +495,42 @@ class Elbo(Latent):
         return {"loss": loss, "state_error": state_error, "reward_error": reward_error, "kl": kl}
 
 
+class Skills(nn.Module):
+    """The autoencoder of skills of Venkatraman et al. 2024: a bidirectional GRU over steps, a prior that sees the first state, and a decoder of
+    each action, column after column or all of them at once."""
+
+    BETA = 0.3
+
+    def __init__(self, dim: int, width: int, layers: int, autoregressive: bool) -> None:
+        super().__init__()
+        self.embed, self.posterior = nn.Linear(STATE + ACTION, width), nn.Linear(2 * width, 2 * dim)
+        sizes = [width] + [2 * width] * (layers - 1)
+        both = ("forwards", "backwards")
+        self.encoder = nn.ModuleList(nn.ModuleDict({way: nn.GRU(size, width, batch_first=True) for way in both}) for size in sizes)
+        self.prior, given = mlp(STATE, width, 2 * dim), STATE + dim
+        columns = range(ACTION) if autoregressive else [0]
+        self.decoder = nn.ModuleList(mlp(given + column, width, 2 if autoregressive else 2 * ACTION) for column in columns)
+
+    def forward(self, given: Tensors) -> Tensors:
+        steps, (state, action) = given["x"].shape[1], given["x"].split([STATE, ACTION], -1)
+        x = functional.relu(self.embed(given["x"]))
+        for layer in self.encoder:
+            x = torch.cat([layer["forwards"](x)[0], layer["backwards"](x.flip(1))[0].flip(1)], -1)
+        half = x.shape[2] // 2
+        mean, log_var = self.posterior(torch.cat([x[:, -1:, :half], x[:, :1, half:]], -1)).chunk(2, -1)
+        log_var = log_var.clamp(*LOG_VAR)
+        code = (mean + (log_var / 2).exp() * given["eps"]).expand(-1, steps, -1)
+        told = [net(torch.cat([state, code, action[..., :column]], -1)).chunk(2, -1) for column, net in enumerate(self.decoder)]
+        means, log_vars = (torch.cat([pair[part] for pair in told], -1) for part in (0, 1))
+        log_vars = log_vars.clamp(*LOG_VAR)
+        constant = ACTION * torch.log(torch.tensor(2 * torch.pi)) / 2
+        nll = -Normal(means, (log_vars / 2).exp()).log_prob(action).sum(-1).mean() - constant
+        prior_mean, prior_log_var = self.prior(state[:, :1]).chunk(2, -1)
+        prior = Normal(prior_mean, (prior_log_var.clamp(*LOG_VAR) / 2).exp())
+        kl = kl_divergence(Normal(mean, (log_var / 2).exp()), prior).sum(-1).mean() / steps
+        return {"loss": nll + self.BETA * kl, "nll": nll, "kl": kl}
+
+
 def window(batch: int, steps: int, latent: int, obs_horizon: int) -> Tensors:
     """What a denoiser is given."""
     given = {"x": torch.randn(batch, steps, STATE + ACTION)}
@@ -612,6 +648,18 @@ def policy_cases() -> dict[str, tuple[nn.Module, Tensors]]:
     }
 
 
+def skill_cases() -> dict[str, tuple[nn.Module, Tensors]]:
+    """And once those are."""
+
+    def given(batch: int, steps: int, dim: int) -> Tensors:
+        return {"x": torch.randn(batch, steps, STATE + ACTION), "eps": torch.randn(batch, 1, dim)}
+
+    return {
+        "skill": (Skills(3, 6, 2, autoregressive=True), given(4, 5, 3)),
+        "skill_normal": (Skills(2, 5, 1, autoregressive=False), given(3, 7, 2)),
+    }
+
+
 def our_name(name: str) -> str:
     """The name of a PyTorch parameter in a checkpoint."""
     name = name.removeprefix("backbone.")
@@ -697,7 +745,8 @@ def main() -> None:
     done = results(cases())
     done |= results(later_cases())
     done |= results(last_cases())
-    save(Path(__file__).with_name("networks.safetensors"), policy_cases(), process() | done)
+    done |= results(policy_cases())
+    save(Path(__file__).with_name("networks.safetensors"), skill_cases(), process() | done)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,8 @@ use ada_diffuser::model::{
     config::{ModelConfig, Restart},
     critic::{Given, Sizes, Value},
     method::{
-        Actions, Backbone, Baseline, Diffused, GruLatent, Guide, Head, History, Inverse, LatentSource, Looks, Schedule, Target, Told,
-        TrueFuture,
+        Actions, Backbone, Baseline, Decoding, Diffused, GruLatent, Guide, Head, History, Inverse, LatentSource, Looks, Schedule, Target,
+        Told, TrueFuture,
     },
     nn::{Activations, Buffer, Params, Traced, gradient},
     normalizer::Affine,
@@ -121,7 +121,23 @@ fn a_tick_allocates_nothing() {
     }
 }
 
-/// Guided, in the future too, with candidates, told, several rows at once; of states or actions alone; of an oracle; chosen by critics.
+/// Whose critics choose: among actions, or among skills.
+fn judged(latent: &GruLatent, skills: bool) -> Agent {
+    agent_with(latent.clone(), Backbone::Mlp { width: 16, depth: 2, dropout: 0.1 }, 1, |config| {
+        (config.method.plan.diffused, config.method.plan.horizon) = (Diffused::Action, 1);
+        if skills {
+            config.method.latent = LatentSource::None;
+            config.method.plan.diffused = Diffused::Code { dim: 4, steps: 3 };
+            config.method.head = Head::Skill { width: 8, layers: 1, action: Decoding::Autoregressive };
+        }
+        config.method.plan.schedule = Schedule::Uniform { steps: 5 };
+        (config.method.guide, config.units.returns) = (Some(Guide::Critic { width: 8 }), Some(Affine::identity(1)));
+        (config.trained.action_horizons, config.trained.refined) = (vec![1], false);
+        (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
+    })
+}
+
+/// Guided, in the future too, with candidates, told, several rows at once; of states or actions alone; of an oracle; chosen by critics; skills.
 #[test]
 fn ticks_of_other_methods_allocate_nothing() {
     let (unet, latent) = (Backbone::Unet { widths: vec![8, 16] }, GruLatent::plain(5, 16, Looks::Block(4)));
@@ -144,21 +160,14 @@ fn ticks_of_other_methods_allocate_nothing() {
     });
     let transformer = Backbone::EncoderDecoder { width: 16, depth: 2, heads: 2, encoder_depth: 1, dropout: 0.1 };
     let policy = agent_with(latent.clone(), transformer, 2, |config| config.method.plan.diffused = Diffused::Action);
-    let actor = Backbone::Mlp { width: 16, depth: 2, dropout: 0.1 };
-    let chosen = agent_with(latent.clone(), actor, 1, |config| {
-        (config.method.plan.diffused, config.method.plan.horizon) = (Diffused::Action, 1);
-        config.method.plan.schedule = Schedule::Uniform { steps: 5 };
-        (config.method.guide, config.units.returns) = (Some(Guide::Critic { width: 8 }), Some(Affine::identity(1)));
-        (config.trained.action_horizons, config.trained.refined) = (vec![1], false);
-        (config.defaults.sampler.streaming, config.defaults.sampler.kappa) = (false, 0.0);
-    });
     for (agent, told, context) in [
         (guided(Guide::Value { widths: vec![8, 16] }), false, None),
         (guided(Guide::DecoderReturn), false, None),
         (guided(Guide::Dual { discrepancy: 0.5 }), false, None),
         (of_states, true, None),
         (policy, false, None),
-        (chosen, false, None),
+        (judged(&latent, false), false, None),
+        (judged(&latent, true), false, None),
         (oracle, false, Some(vec![vec![0.3, 0.4]])),
     ] {
         let (config, guide) = (agent.config(), agent.config().method.guide.as_ref());

@@ -1,7 +1,8 @@
 """A double of the server for faults that a real one shows only by chance: the step protocol and both faces, small.
 
 An act's actions are `step + executed rewards`, so a test sees what arrived; its latent is the number of acts of earlier episodes that it
-looks back on, and a half; with a guide its value is minus its step. Faults are scripted: each act takes the next one.
+looks back on, or of steps that its session was opened with, and a half; with a guide its value is minus its step. Faults are scripted: each
+act takes the next one.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Refusal(Exception):
 class Session:
     committed: int = 0
     last: tuple[object, list[float]] | None = None
-    #: Acts of the episodes before.
+    #: Acts of the episodes before, or steps of the history.
     kept: int = 0
 
 
@@ -68,12 +69,17 @@ class Core:
     traits: dict = field(default_factory=dict)
     #: Options of each session that was opened, as the face has them.
     options: list[object] = field(default_factory=list)
+    #: Histories of each session that was opened, as JSON has them.
+    histories: list[list[dict]] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def open(self) -> str:
+    def open(self, history: list[dict]) -> str:
         with self.lock:
+            self.histories.append(history)
+            if history and not self.keeps_history:
+                raise Refusal("REQUEST_INVALID")
             name, self.opened = f"s{self.opened}", self.opened + 1
-            self.sessions[name] = Session()
+            self.sessions[name] = Session(kept=len(history))
             return name
 
     def reset(self, name: str, seed: int | None, keep_history: bool) -> None:
@@ -150,7 +156,11 @@ class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
 
     def OpenSession(self, request, context):  # noqa: N802
         self.core.options.append(request.options)
-        session = agent_pb2.Session(session_id=self.core.open(), seed=request.seed, options=request.options)
+        try:
+            name = self.core.open([_step(done) for done in request.history])
+        except Refusal as refusal:
+            self._refuse(refusal, context)
+        session = agent_pb2.Session(session_id=name, seed=request.seed, options=request.options)
         return agent_pb2.OpenSessionResponse(session=session, model=_model(self.core))
 
     def ResetSession(self, request, context):  # noqa: N802
@@ -215,6 +225,11 @@ class GrpcFake(agent_pb2_grpc.AgentServicer, models_pb2_grpc.ModelsServicer):
         return agent_pb2.ActResponse(**{**chunk, "actions": actions, "start": "START_WARM"})
 
 
+def _step(done: agent_pb2.Executed) -> dict:
+    vectors = {name: list(getattr(done, name).values) for name in ("state", "action") if done.HasField(name)}
+    return {**vectors, **({"reward": done.reward} if done.HasField("reward") else {})}
+
+
 def _model(core: Core) -> models_pb2.Model:
     told = [{**one, "kind": f"TOLD_KIND_{one['kind'].upper()}"} for one in core.traits.get("told", [])]
     special = {"sampler": models_pb2.SamplerOptions(kappa=1.0, latent="LATENT_MODE_MEAN"), "told": told}
@@ -251,7 +266,11 @@ class HttpFake(BaseHTTPRequestHandler):
         if self.path == "/v1/sessions":
             options = body.get("options", {})
             self.core.options.append(options)
-            session = _session(self.core.open(), 0)
+            try:
+                session = _session(self.core.open(body.get("history", [])), 0)
+            except Refusal as refusal:
+                status = CODES[refusal.reason][1]
+                return self._answer(status, {"status": status, "reason": refusal.reason, "detail": "refused"})
             session["options"] |= {name: _in_few_digits(value) for name, value in options.items()}
             return self._answer(201, {"session": session, "model": {**MODEL, **self.core.traits}})
         if self.path == "/v1/act:batch":

@@ -20,6 +20,10 @@ def opened(client: Client, **settings: Any) -> tuple[Any, ...]:
     return session.seed, session.options, session.summary().ttl_ms
 
 
+def warmed(client: Client, history: Any) -> bytes:
+    return client.open_session(seed=1, history=history).act(STATE).actions.tobytes()
+
+
 def optioned(client: Client, **options: Any) -> tuple[Any, ...]:
     return opened(client, options=SamplerOptions(**options))
 
@@ -67,6 +71,7 @@ SAME: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, Any]]] = {
     "reward of success": (acted, {"reward": np.bool_(True)}, {"reward": 1.0}),
     "executed reward": (acted, {"executed": [Executed(reward=np.array([0.5]))]}, {"executed": [Executed(reward=0.5)]}),
     "reported reward": (reported, {"reward": np.array([0.5], dtype=">f8")}, {"reward": 0.5}),
+    "history": (warmed, {"history": (Executed(STATE, np.ones(2), np.array([1])),)}, {"history": [Executed(STATE.tolist(), [1, 1], 1)]}),
 }
 
 REFUSED: dict[str, tuple[Callable[..., Any], dict[str, Any], str]] = {
@@ -111,6 +116,12 @@ REFUSED: dict[str, tuple[Callable[..., Any], dict[str, Any], str]] = {
     "executed": (acted, {"executed": [0.5]}, "observation.executed[0]"),
     "nothing_executed": (acted, {"nothing_executed": "no"}, "observation.nothing_executed"),
     "reported reward": (reported, {"reward": math.nan}, "reward"),
+    "history": (warmed, {"history": [Executed(reward=1), (STATE, [1, 1], 1)]}, "history[1]"),
+    "state of a history": (warmed, {"history": [Executed(reward=1), Executed(np.append(STATE[1:], np.nan))]}, "history[1].state[3]"),
+    "short state of a history": (warmed, {"history": [Executed(reward=1), Executed(STATE[1:])]}, "history[1].state"),
+    "action of a history": (warmed, {"history": [Executed(action=[0.1])]}, "history[0].action"),
+    "reward of a history": (warmed, {"history": [Executed(reward="good")]}, "history[0].reward"),
+    "history of nothing": (warmed, {"history": [Executed(reward=1), Executed()]}, "history[1]"),
 }
 
 

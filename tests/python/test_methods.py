@@ -6,16 +6,17 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from server import ROOT, running
 
-from ada_diffuser import Client, InvalidInput, SamplerOptions
+from ada_diffuser import Client, Executed, InvalidInput, SamplerOptions
 from ada_diffuser.commands.collect import main as collect
 from ada_diffuser.rollout import Trial, evaluate
+from ada_diffuser.rollout.warm_start import WarmStart
 
 TRAINER = Path(os.environ.get("ADA_TRAINER", ROOT / "target/release/ada-trainer"))
 RECIPE = ROOT / "models/point-wind-s/recipe.toml"
@@ -32,20 +33,24 @@ TINY = [
     "stages.denoise.learning_rate.warm_up=1",
     "checkpoint_every=100",
 ]
+TINY_SKILLS = [
+    *(f"stages.{stage}.{key}" for stage in ("skills", "values") for key in ("steps=4", "learning_rate.warm_up=1")),
+    "losses.double_q.candidates=2",
+]
 TINY_LATENT = ["losses.elbo.batch=4", "stages.identify.steps=4", "stages.identify.learning_rate.warm_up=1", "stages.identify.gate="]
 
 
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of checkpoints, one a method, and `plain`, the recipe itself."""
+    """A folder of checkpoints, one a method, and `plain`, the recipe itself; of data in sessions, so that each may keep a history."""
     folder = tmp_path_factory.mktemp("methods")
     data = folder / "data.h5"
-    assert collect(["--env", "point-wind-s", "--episodes", "12", "--quiet", "--out", str(data)]) == 0
+    assert collect(["--env", "point-wind-s", "--episodes", "12", "--session-episodes", "2", "--quiet", "--out", str(data)]) == 0
     for method in [None, *METHODS]:
         name = method.stem if method else "plain"
         text = method.read_text(encoding="utf-8") if method else ""
         network = next(network for kind, network in TINY_NETWORKS.items() if f'backbone" = {{ kind = "{kind}' in text or not kind)
-        keys = [network, *TINY, *([] if 'stages.identify"' in text else TINY_LATENT)]
+        keys = [network, *TINY, *([] if '"losses.elbo"' in text else TINY_LATENT), *(TINY_SKILLS if "losses.skill" in text else [])]
         words = [word for key in keys for word in ("--set", key)]
         chosen = ["--with", str(method)] if method else []
         command = [str(TRAINER), "run", str(RECIPE), "--data", str(data), "--out", str(folder / "models" / name), *chosen, *words]
@@ -73,6 +78,40 @@ def test_a_method_flies(method: str, checkpoints: Path, address: str) -> None:
             assert (np.abs(actions[0]) <= 1.0).all() and np.array_equal(actions[0], actions[1])
 
 
+@pytest.mark.parametrize("method", ["metadiffuser", "lilac", "plain"])
+def test_a_method_begins_warm(method: str, checkpoints: Path, address: str) -> None:
+    """The warm-start transitions of MetaDiffuser: handed over at the open they are what a session has that lived them, by both faces."""
+    recorded = [WarmStart.load(checkpoints.parent / "data.h5", episode) for episode in (3, 4)]
+    state = np.array([0.5, -0.5, 0.1, 0.0], np.float32)
+    told = []
+    for face in ("grpc", "http"):
+        with Client(f"{face}://{address}") as client:
+
+            def act(history: Sequence[Executed], client: Client = client) -> tuple[bytes, bytes]:
+                with client.open_session(method, seed=9, history=history) as session:
+                    chunk = session.act(state)
+                    return chunk.actions.tobytes(), chunk.latent_mean.tobytes()
+
+            with client.open_session(method, seed=1) as session:
+                assert session.model.trained.sessions
+                session.act(state, recorded[0].steps)
+                session.reset(seed=9, keep_history=True)
+                chunk = session.act(state)
+            warm = [act(start.steps) for start in recorded]
+            assert warm[0] == (chunk.actions.tobytes(), chunk.latent_mean.tobytes()) and len({*warm, act(())}) == 3
+            flown = evaluate(client, Trial("point-wind-s", method, episodes=2, seed=7, vector=2, episode_steps=6, warm_start=recorded[0]))
+            told.append((warm, flown.returns.tolist()))
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("method", ["diffuser", "oracle", "dynamite"])
+def test_a_method_that_looks_back_on_nothing_says_so(method: str, checkpoints: Path, address: str) -> None:
+    """Of a belief of the last step the border is all that it sees of another episode."""
+    with Client(f"http://{address}") as client, pytest.raises(InvalidInput, match="looks back") as refused:
+        client.open_session(method, history=WarmStart.load(checkpoints.parent / "data.h5").steps)
+    assert refused.value.field == "history"
+
+
 def _ladder(checkpoints: Path, method: str) -> bool:
     config = json.loads((checkpoints / method / "config.json").read_text(encoding="utf-8"))
     return config["method"]["plan"]["schedule"]["kind"] == "ladder"
@@ -93,6 +132,10 @@ def test_what_a_method_takes_is_told(address: str) -> None:
         with client.open_session("guided", seed=1, options=SamplerOptions(**cold, candidates=8, temperature=1.0)) as session:
             chunk = session.act(np.zeros(4, np.float32))
             assert chunk.value is not None and chunk.value_spread > 0.0 and chunk.evaluations == 8 * chunk.passes
+        with client.open_session("ldcq", seed=1) as session:
+            chunks = [session.act(np.zeros(4, np.float32)) for _ in range(11)]
+            assert [chunk.evaluations for chunk in chunks] == [640, *([0] * 9), 640], "a skill lasts for ten steps"
+            assert [chunk.value is None for chunk in chunks] == [False, *([True] * 9), False]
         told = {scale: act("told-return", SamplerOptions(**cold, told_return=-0.1, free_guidance_scale=scale)) for scale in (0.0, 1.0, 3.0)}
         assert not np.array_equal(told[0.0], told[1.0]) and not np.array_equal(told[1.0], told[3.0])
         goals = [act("told-goal", SamplerOptions(**cold, told_goal=goal)) for goal in ((-1.0, 0.0), (1.0, 0.0))]

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ada_diffuser.errors import AdaError, InvalidInput, NotFound, TooLarge, Unavailable
 from ada_diffuser.faces import Face, connect
-from ada_diffuser.messages import ActCall, Chunk, Executed, Model, Observation, SamplerOptions, SessionSummary, executed_values
+from ada_diffuser.messages import ActCall, Chunk, Executed, Model, Observation, OpenCall, SamplerOptions, SessionSummary, executed_values
 from ada_diffuser.retry import Backoff, RetryPolicy
 from ada_diffuser.values import column, flag, invalid, matrix, text, vector, whole
 
@@ -119,15 +119,18 @@ class Client:
         seed: int | None = None,
         options: SamplerOptions | None = None,
         ttl_ms: int | None = None,
+        history: Sequence[Executed] = (),
     ) -> Session:
         """A session at committed step 0. Without `seed` the server draws one (`session.seed`).
 
+        `history` are steps that were recorded before it in the same hidden context, oldest first; the latent looks back on them as on an
+        episode before (`reset(keep_history=True)`). None in them is unknown; `Executed()`, which tells nothing, is the border between two
+        episodes. Refused where the model's `trained.sessions` is false, or nothing in it looks back so far.
         If an answer is lost on the way, the retry gets the session that the first attempt has opened.
         """
-        name, wanted = _model_name(model), _options(options)
-        seed, ttl_ms = _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
-        request_id = uuid4().hex
-        summary, spec = self._tried(lambda timeout_s: self._face.open_session(name, seed, wanted, ttl_ms, request_id, timeout_s))
+        name, seed, ttl_ms = _model_name(model), _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
+        call = OpenCall(name, seed, _options(options), ttl_ms, uuid4().hex, executed_values(history, "history"))
+        summary, spec = self._tried(lambda timeout_s: self._face.open_session(call, timeout_s))
         return Session(self, summary, spec)
 
     def attach(self, session_id: str) -> Session:
@@ -357,7 +360,7 @@ class Session:
             step=self._committed_step + 1,
             episode=self._episode,
             state=vector(observation.state, "observation.state"),
-            executed=executed_values(observation.executed),
+            executed=executed_values(observation.executed, "observation.executed"),
             nothing_executed=flag(observation.nothing_executed, "observation.nothing_executed"),
             deadline_ms=_whole_if_given(deadline_ms, "deadline_ms", bits=32),
             want_planned_states=flag(planned_states, "want_planned_states"),

@@ -23,6 +23,7 @@ __all__ = [
     "Missing",
     "Model",
     "Observation",
+    "OpenCall",
     "Returns",
     "SamplerOptions",
     "SessionSummary",
@@ -41,9 +42,9 @@ Start = Literal["cold", "warm", "renoised"]
 class Executed:
     """One executed step; what is None is unknown, and masked."""
 
-    #: The state in which it was executed, `(state_dim,)`; in the first one of an act: that of the last observation.
+    #: The state in which it was executed, `(state_dim,)`; None in the first one of an act: that of the last observation.
     state: ArrayLike | None = None
-    #: The action, `(action_dim,)`; None: the one that was returned for this step.
+    #: The action, `(action_dim,)`; None: the one that was returned for this step, if one was.
     action: ArrayLike | None = None
     #: The reward that followed: a number, or an array of one.
     reward: ArrayLike | None = None
@@ -75,6 +76,19 @@ class ExecutedValues:
 
 
 @dataclass(frozen=True, eq=False)
+class OpenCall:
+    """One open on the wire. A retry sends this very value again, so it gets the session that the first attempt opened."""
+
+    model: str
+    seed: int | None
+    options: SamplerOptions
+    ttl_ms: int | None
+    #: Of this request: while its session lives, no other is opened by it.
+    request_id: str
+    history: tuple[ExecutedValues, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class ActCall:
     """One act on the wire. A retry sends this very value again, so it can never become another step."""
 
@@ -91,11 +105,11 @@ class ActCall:
     context: Floats | None = None
 
 
-def executed_values(executed: Sequence[Executed]) -> tuple[ExecutedValues, ...]:
-    """The executed steps of an observation, checked."""
+def executed_values(executed: Sequence[Executed], field: str) -> tuple[ExecutedValues, ...]:
+    """The executed steps of this field, checked."""
     values = []
     for i, step in enumerate(executed):
-        path = f"observation.executed[{i}]"
+        path = f"{field}[{i}]"
         if not isinstance(step, Executed):
             raise invalid(path, f"is no Executed, but a {type(step).__name__}")
         state = None if step.state is None else vector(step.state, f"{path}.state")
@@ -167,7 +181,7 @@ class Trained:
     #: Sub-steps per rung, ascending.
     sub_steps: tuple[int, ...]
     missing: Missing
-    #: Whether histories crossed from one episode into the next, so that a reset may keep them.
+    #: Whether histories crossed from one episode into the next, so that a reset may keep one, and an open bring one.
     sessions: bool = False
 
 

@@ -5,7 +5,7 @@ use super::{
     AgentError, Ask, Chunk, Episode, Start,
     candidate::Candidate,
     chain::Chain,
-    episode::Planned,
+    episode::{Planned, Skill},
     restart::{Stored, choose_start},
     types::Known,
 };
@@ -73,6 +73,9 @@ impl Act {
             )
         };
         let Known { told, truth, aligned, .. } = &known;
+        // Of a skill under way there is nothing to choose.
+        let held = episode.skill().is_some();
+        let candidates = if held { 1 } else { options.candidates };
         Self {
             aligned: *aligned,
             started: false,
@@ -81,8 +84,8 @@ impl Act {
             anchor: Chain::new(1, method.latent.dim()),
             told: told.clone(),
             truth: truth.clone(),
-            candidates: (0..options.candidates).map(candidate).collect(),
-            choice: Choice { made: options.candidates == 1 && options.guidance_scale == 0.0, ..Choice::default() },
+            candidates: (0..candidates).map(candidate).collect(),
+            choice: Choice { made: held || options.candidates == 1 && options.guidance_scale == 0.0, ..Choice::default() },
             episode,
         }
     }
@@ -93,7 +96,7 @@ impl Act {
             Ask::Filter => !self.started,
             Ask::RollOut => self.started && !self.rolled_out && !self.asks(Ask::Refine),
             Ask::Choose => self.started && !self.choice.made && self.candidates.iter().all(Candidate::is_done) && !self.has_failed(),
-            Ask::Refine | Ask::Denoise | Ask::Invert => {
+            Ask::Refine | Ask::Denoise | Ask::Decode => {
                 self.started && self.candidates.iter().any(|window| window.asks(ask, self.options()))
             }
         }
@@ -129,6 +132,9 @@ impl Act {
 
     /// Forwards that it still asks for; of one that has not started those of a warm start, if there may be one.
     pub fn evaluations_left(&self) -> usize {
+        if self.episode.skill().is_some() {
+            return 0;
+        }
         let left = |window: &Candidate| match self.stored().filter(|_| !self.started) {
             Some(stored) => window.descent().rows_left(stored.row()),
             None => window.descent().evaluations_left(),
@@ -202,6 +208,11 @@ impl Act {
     /// Chooses between the stored window and a cold start, and fills the windows.
     pub(super) fn start(&mut self, config: &ModelConfig, walk: Walk) {
         self.started = true;
+        if let Some(skill) = self.episode.skill() {
+            self.start = Start::Warm;
+            self.candidates.iter_mut().for_each(|window| window.hold(&skill.code));
+            return;
+        }
         let (belief, rung) = (self.first().latents().get(0), self.first().descent().rung());
         let known = self.first().descent().known();
         self.start = self.stored().map_or(Start::Cold, |stored| choose_start(stored, known, belief, rung, config));
@@ -364,8 +375,18 @@ impl Act {
             start,
             degraded: descent.is_degraded(),
         };
+        let skill = Self::skill_after(&episode, &chosen, config);
         let planned = Planned::new(descent.known().to_vec(), actions);
         let stored = Stored::new(chosen.into_window(), anchor);
-        Ok((episode.after(planned, stored, latent), chunk))
+        let after = episode.after(planned, stored, latent);
+        Ok((if let Some(skill) = skill { after.with_skill(skill) } else { after }, chunk))
+    }
+
+    /// The skill that this act began, of a model that has skills. One that a deadline cut short is done once, and no longer.
+    fn skill_after(episode: &Episode, chosen: &Candidate, config: &ModelConfig) -> Option<Skill> {
+        let (steps, descent) = (config.method.plan.diffused.code_steps()?, chosen.descent());
+        let lasts = if descent.is_degraded() { 1 } else { steps as u64 };
+        let begun = || Skill { code: descent.given(0).to_vec(), end: episode.time() + lasts };
+        episode.skill().is_none().then(begun)
     }
 }

@@ -8,6 +8,7 @@ use super::{
 };
 use crate::model::{
     denoiser::Given,
+    head::{InverseDynamics, Skills},
     latent::{Evidence, Gaussian, LatentModel, hold_within},
     method::GruLatent,
     nn::{Activations, Buffer},
@@ -25,7 +26,7 @@ impl Agent {
             Ask::RollOut => self.roll_out(acts),
             Ask::Refine => self.refine(acts),
             Ask::Denoise => self.denoise(acts),
-            Ask::Invert => self.invert(acts),
+            Ask::Decode => self.decode(acts),
             Ask::Choose => self.choose(acts),
         }
     }
@@ -158,10 +159,23 @@ impl Agent {
         }
     }
 
+    /// The next action of each plan that has none itself.
+    fn decode(&self, acts: &mut [Act]) -> Result<()> {
+        let mut actions = match (&self.networks().inverse, &self.networks().skill) {
+            (Some(inverse), _) => self.between_states(inverse, acts)?,
+            (None, Some(skill)) => self.by_codes(skill, acts)?,
+            (None, None) => candle_core::bail!("nothing makes actions of these plans: is a bug"),
+        };
+        for (window, action) in asking_mut(acts, Ask::Decode).zip(actions.chunks_exact_mut(self.config().layout.action_dim)) {
+            self.action_bounds().hold(action);
+            window.push_action(action);
+        }
+        Ok(())
+    }
+
     /// The actions that lead from state to state.
-    fn invert(&self, acts: &mut [Act]) -> Result<()> {
-        let Some(inverse) = &self.networks().inverse else { return Ok(()) };
-        let (layout, rows) = (self.config().layout, || asking(acts, Ask::Invert));
+    fn between_states(&self, inverse: &InverseDynamics, acts: &[Act]) -> Result<Buffer> {
+        let (layout, rows) = (self.config().layout, || asking(acts, Ask::Decode));
         let states = rows::gather(rows(), [1, 2 * layout.state_dim], |row, out| {
             let [now, next] = row.window().states_around(self.walk());
             out[..layout.state_dim].copy_from_slice(now);
@@ -174,12 +188,15 @@ impl Agent {
             let rows = rows().zip(out.chunks_exact_mut(layout.action_dim));
             rows.for_each(|(row, out)| row.window().draw_inverse(level, scale, row.act().options().temperature, out));
         };
-        let mut actions = inverse.sample(self.inverse_process(), (&states, latents.as_ref()), layout.action_dim, draw)?;
-        for (window, action) in asking_mut(acts, Ask::Invert).zip(actions.chunks_exact_mut(layout.action_dim)) {
-            self.action_bounds().hold(action);
-            window.push_action(action);
-        }
-        Ok(())
+        inverse.sample(self.inverse_process(), (&states, latents.as_ref()), layout.action_dim, draw)
+    }
+
+    /// What codes say is to be done in the states of now.
+    fn by_codes(&self, skill: &Skills, acts: &[Act]) -> Result<Buffer> {
+        let gather = |width: usize, write: &dyn Fn(Row, &mut [f32])| rows::gather(asking(acts, Ask::Decode), [1, width], write);
+        let state = gather(self.config().layout.state_dim, &|row, out| out.copy_from_slice(row.window().descent().known()))?;
+        let code = gather(self.walk().columns.width(), &|row, out| out.copy_from_slice(row.window().descent().given(0)))?;
+        skill.act(&state, &code)
     }
 
     /// Numbers of a window.

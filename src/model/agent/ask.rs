@@ -11,13 +11,13 @@ pub enum Ask {
     Refine,
     /// The clean window.
     Denoise,
-    /// The action that leads from one state of a plan to the next.
-    Invert,
+    /// The action of a step, where a plan has none: that which leads from one of its states to the next, or does what a code says.
+    Decode,
     /// What the plans are worth, to choose among them.
     Choose,
 }
 
 impl Ask {
     /// In this order they are answered in one tick: an act that has its latents can be denoised at once.
-    pub const ORDER: [Self; 6] = [Self::Filter, Self::RollOut, Self::Refine, Self::Denoise, Self::Invert, Self::Choose];
+    pub const ORDER: [Self; 6] = [Self::Filter, Self::RollOut, Self::Refine, Self::Denoise, Self::Decode, Self::Choose];
 }

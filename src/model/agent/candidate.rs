@@ -67,6 +67,16 @@ impl Candidate {
         self.descent.begin_with(window, rows, walk);
     }
 
+    /// See [`Descent::hold`].
+    pub(super) fn hold(&mut self, code: &[f32]) {
+        self.descent.hold(code);
+    }
+
+    /// What critics judge of it: the first action, or the code of a skill.
+    pub(super) fn choice(&self, walk: Walk) -> &[f32] {
+        if walk.columns.code.is_empty() { self.action(0) } else { self.descent.given(0) }
+    }
+
     /// What is left for the next act.
     pub(super) fn into_window(self) -> Window {
         self.descent.into_window()
@@ -83,7 +93,7 @@ impl Candidate {
             Ask::Filter | Ask::RollOut | Ask::Choose => false,
             Ask::Refine => self.waits() && self.descent.is_ready() && options.kappa > 0.0 && !self.latents.is_empty(),
             Ask::Denoise => self.waits() && !self.descent.is_done(),
-            Ask::Invert => !self.descent.has_failed() && !self.waits(),
+            Ask::Decode => !self.descent.has_failed() && !self.waits(),
         }
     }
 

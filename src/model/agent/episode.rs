@@ -30,6 +30,17 @@ pub struct Episode {
     window: Option<Stored>,
     /// Mean and log-variance of the latent of the last chunk's first step.
     latent: Option<(Vec<f32>, Vec<f32>)>,
+    /// The skill that was last begun.
+    skill: Option<Skill>,
+}
+
+/// A skill under way.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Skill {
+    /// What stands for it.
+    pub(super) code: Vec<f32>,
+    /// When it is over: the environment time of the next one's first decision.
+    pub(super) end: u64,
 }
 
 /// What the last act saw and answered, normalized units.
@@ -57,7 +68,7 @@ impl Episode {
     /// A fresh one; `memory` is the width of a GRU that runs on, or 0.
     pub(super) fn new(seed: u64, options: SamplerOptions, memory: usize) -> Self {
         let (history, memory) = (VecDeque::new(), vec![0.0; memory]);
-        Self { seed, options, time: 0, history, memory, unread: 0, planned: None, window: None, latent: None }
+        Self { seed, options, time: 0, history, memory, unread: 0, planned: None, window: None, latent: None, skill: None }
     }
 
     /// See [`super::Agent::reset`]. A token of which nothing is known stands between the old episode and the new one: from the last state of
@@ -65,7 +76,9 @@ impl Episode {
     pub(super) fn reset(&self, seed: u64, keep_history: bool) -> Self {
         let mut fresh = Self::new(seed, self.options.clone(), self.memory.len());
         if keep_history {
-            fresh.history.clone_from(&self.history);
+            // Room for the border too: what grows by one takes twice as much, and a history that waits to be read may be long.
+            fresh.history.reserve_exact(self.history.len() + 1);
+            fresh.history.extend(self.history.iter().cloned());
             fresh.memory.clone_from(&self.memory);
             fresh.unread = self.unread;
             // Where nothing was lived there is no border, however often it is reset.
@@ -147,11 +160,21 @@ impl Episode {
         self.window.take()
     }
 
+    /// The skill under way, if there is one.
+    pub(super) fn skill(&self) -> Option<&Skill> {
+        self.skill.as_ref().filter(|skill| self.time < skill.end)
+    }
+
     /// The episode after an act; the window is kept for the next one where acts stream.
     pub(super) fn after(self, planned: Planned, window: Stored, latent: (Vec<f32>, Vec<f32>)) -> Self {
         let window = self.options.streaming.then_some(window);
         let latent = (!latent.0.is_empty()).then_some(latent);
         Self { planned: Some(planned), window, latent, ..self }
+    }
+
+    /// The same with another skill under way.
+    pub(super) fn with_skill(self, skill: Skill) -> Self {
+        Self { skill: Some(skill), ..self }
     }
 
     /// Noise seed of the episode.
@@ -184,6 +207,7 @@ impl Episode {
         let window = self.window.as_ref().map_or(0, Stored::size_bytes);
         let latent = self.latent.as_ref().map_or(0, |(mean, log_var)| floats(Some(mean)) + floats(Some(log_var)));
         let memory = self.memory.capacity() * size_of::<f32>();
-        size_of::<Self>() + history + memory + planned + window + latent
+        let skill = floats(self.skill.as_ref().map(|skill| &skill.code));
+        size_of::<Self>() + history + memory + planned + window + latent + skill
     }
 }

@@ -5,7 +5,7 @@ use super::{
     rows::{self, Row, evaluated},
 };
 use crate::model::{
-    critic::Critic,
+    critic::{Critic, Judged},
     diffusion::guidance::{Futures, Seat, lead},
     nn::{Activations, Buffer},
     noise::Slot,
@@ -120,16 +120,16 @@ impl Agent {
         self.judge().worth(&x, latents.as_ref())
     }
 
-    /// By the lesser of two critics, of the first actions in the state of now.
+    /// By the lesser of two critics, of the first actions, or of codes, in the state of now.
     fn worth_of_actions<'a>(&self, critic: &Critic, candidates: impl Iterator<Item = Row<'a>> + Clone + 'a) -> Result<Buffer> {
-        let (layout, dim) = (self.config().layout, self.config().method.latent.dim());
+        let (layout, dim, walk) = (self.config().layout, self.config().method.latent.dim(), self.walk());
         let gather = |width: usize, write: &dyn Fn(Row<'a>) -> &'a [f32]| {
             rows::gather(candidates.clone(), [1, width], |row, out| out.copy_from_slice(write(row)))
         };
         let state = gather(layout.state_dim, &|row| row.window().descent().known())?;
-        let action = gather(layout.action_dim, &|row| row.window().action(0))?;
+        let choice = gather(Judged::of(layout, &self.config().method).choice_dim, &|row| row.window().choice(walk))?;
         let latent = (dim > 0).then(|| gather(dim, &|row| row.window().latents().mean_of_step(0))).transpose()?;
-        let [mut worth, other] = critic.q(&state, &action, latent.as_ref())?;
+        let [mut worth, other] = critic.q(&state, &choice, latent.as_ref())?;
         worth.iter_mut().zip(other.iter()).for_each(|(worth, other)| *worth = worth.min(*other));
         Ok(worth)
     }

@@ -28,7 +28,7 @@ use crate::model::{
     columns::{Bounds, Columns},
     config::ModelConfig,
     diffusion::{descent::Walk, guidance::Judge, process::Process, schedule::Table},
-    method::{GruLatent, Told, TrueFuture},
+    method::{GruLatent, Method, Told, TrueFuture},
     options::SamplerOptions,
 };
 
@@ -106,10 +106,44 @@ impl Agent {
     /// # Errors
     /// [`AgentError::HistoryNotKept`] if `keep_history` asks for what training never saw.
     pub fn reset(&self, episode: &Episode, seed: u64, keep_history: bool) -> Result<Episode, AgentError> {
-        if keep_history && !self.config.trained.sessions {
-            return Err(AgentError::HistoryNotKept);
+        if keep_history {
+            self.check_keeps_history("keep_history")?;
         }
         Ok(episode.reset(seed, keep_history))
+    }
+
+    /// A fresh episode whose latent looks back on steps that were lived before it, oldest first: the warm-start transitions of MetaDiffuser
+    /// (Ni et al. 2023). It is the episode that [`Agent::reset`] with `keep_history` gives a session that has lived them, its border included.
+    /// Nobody planned them here, so that what they do not tell is unknown; a step that tells nothing is the border between two of the
+    /// episodes that they come from. Without a history it is the episode that [`Agent::open`] gives.
+    ///
+    /// # Errors
+    /// Those of [`Agent::open`]; [`AgentError::InvalidHistory`] naming the step, or where no network looks back so far that it would see any;
+    /// [`AgentError::HistoryNotKept`] where training never saw a history cross into another episode.
+    pub fn recall(&self, seed: u64, options: &SamplerOptions, history: &[Executed]) -> Result<Episode, AgentError> {
+        let mut lived = self.open(seed, options)?;
+        if history.is_empty() {
+            return Ok(lived);
+        }
+        self.check_looks_back()?;
+        self.check_keeps_history("history")?;
+        lived.commit(self.history_tokens(history)?, self.kept_len());
+        Ok(lived.reset(seed, true))
+    }
+
+    /// That a network sees more of the past than the border which a history ends with.
+    fn check_looks_back(&self) -> Result<(), AgentError> {
+        let Method { latent, plan, .. } = &self.config.method;
+        let runs_on = latent.gru().is_some_and(|gru| gru.memory_len() > 0);
+        if runs_on || latent.block_len().max(plan.obs_horizon - 1) > 1 {
+            return Ok(());
+        }
+        let reason = "would change nothing: no network of this checkpoint looks back into another episode; leave the field out".into();
+        Err(AgentError::InvalidHistory { field: "history".into(), reason })
+    }
+
+    fn check_keeps_history(&self, field: &'static str) -> Result<(), AgentError> {
+        if self.config.trained.sessions { Ok(()) } else { Err(AgentError::HistoryNotKept { field }) }
     }
 
     /// Checks the observation and begins an act on a copy of the episode; no network evaluation yet.
@@ -129,8 +163,13 @@ impl Agent {
         };
         let table = Table::of(plan, options.sub_steps);
         let table = table.map_err(|reason| AgentError::InvalidOptions { field: "sub_steps", reason })?;
-        episode.commit(executed, self.config.method.latent.block_len().max(plan.obs_horizon));
+        episode.commit(executed, self.kept_len());
         Ok(Act::new(episode, known, table, &self.config))
+    }
+
+    /// Tokens of the past that an episode keeps, beside those that a GRU has yet to read.
+    fn kept_len(&self) -> usize {
+        self.config.method.latent.block_len().max(self.config.method.plan.obs_horizon)
     }
 
     /// What is told of what is wanted, normalized, and 1; zeros where nothing is.

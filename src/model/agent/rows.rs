@@ -6,7 +6,6 @@ use crate::model::{
     config::ModelConfig,
     diffusion::descent::Walk,
     latent::{Evidence, Gaussian, GaussianRef, Tokens},
-    method::Diffused,
     nn::{Activations, Buffer},
     trajectory::TokenRef,
 };
@@ -120,7 +119,7 @@ pub(super) fn unread<'a>(acts: impl Iterator<Item = &'a Act> + Clone, config: &M
 pub(super) fn observed<'a>(rows: impl Iterator<Item = Row<'a>> + Clone + 'a, config: &ModelConfig, walk: Walk) -> Result<Option<Buffer>> {
     let (plan, columns) = (&config.method.plan, Columns::state_action(config.layout));
     let [steps, width] = plan.observed(config.layout.widths());
-    let policy = plan.diffused == Diffused::Action;
+    let policy = !plan.diffused.has_states();
     let write = |row: Row<'a>, out: &mut [f32]| {
         for (step, out) in out.chunks_exact_mut(width).enumerate() {
             let TokenRef { state, action, .. } = match (policy, steps - 1 - step) {

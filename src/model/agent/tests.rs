@@ -15,7 +15,9 @@ use crate::model::{
 mod executed;
 mod guidance;
 mod methods;
+mod recall;
 mod running;
+mod skills;
 mod trained;
 
 const HORIZON: usize = 8;

@@ -70,9 +70,9 @@ pub struct Observation {
 /// One executed step; what is missing is masked.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Executed {
-    /// The state in which it was executed; for the first one the last observation is known and used when this is missing.
+    /// The state in which it was executed; for the first one of an act the last observation is known and used when this is missing.
     pub state: Option<Vec<f32>>,
-    /// The action; missing: the one returned for this step.
+    /// The action; missing: the one returned for this step, if one was.
     pub action: Option<Vec<f32>>,
     /// The reward that followed.
     pub reward: Option<f32>,
@@ -111,7 +111,7 @@ pub struct Chunk {
 pub enum Start {
     /// From pure noise.
     Cold,
-    /// From the window of the act before, as it was.
+    /// From the window of the act before, as it was; or the skill of an act before goes on.
     Warm,
     /// From the window of the act before, noised again by this many rungs.
     Renoised(u32),
@@ -136,12 +136,23 @@ pub enum AgentError {
         /// What is wrong and what is allowed.
         reason: String,
     },
-    /// A history is to be kept that training never saw cross into another episode.
+    /// The history that an episode is to begin with does not fit the model.
+    #[error("{field}: {reason}")]
+    InvalidHistory {
+        /// `history`, or a path in it, e.g. `history[2].action`.
+        field: String,
+        /// What is wrong and what is expected.
+        reason: String,
+    },
+    /// A history is to go over into another episode, which training never saw one do.
     #[error(
-        "is true, but this checkpoint was trained on episodes one by one: train on a data set with `infos/session`, or begin each episode \
-         without a history"
+        "asks for a history, but this checkpoint was trained on episodes one by one: train on a data set with `infos/session`, or begin each \
+         episode without one"
     )]
-    HistoryNotKept,
+    HistoryNotKept {
+        /// What asks for it.
+        field: &'static str,
+    },
     /// The network answered with NaN or infinity.
     #[error("the network's output is not finite")]
     NonFinite,

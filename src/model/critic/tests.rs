@@ -113,7 +113,11 @@ fn widths_that_do_not_fit_are_named() {
 fn critics_against_pytorch() {
     let (golden, layout) = (Golden::of("critic"), Layout { state_dim: 3, action_dim: 2 });
     golden.check_training(|given, params| {
-        let critic = Critic::new(layout, 4, 9, params)?;
+        let critic = Critic::new(
+            Judged { state_dim: layout.state_dim, choice_dim: layout.action_dim, latent_dim: 4, state_alone: true },
+            9,
+            params,
+        )?;
         let of = Transitions {
             state: &given["state"],
             action: &given["action"],

@@ -1,9 +1,11 @@
-//! Critics of single actions, learned from what came of them (implicit Q-learning, Kostrikov et al. 2022): two of the action in a state, of which
-//! the lesser counts, and one of the state, which is what the better ones of the data's actions are worth.
+//! Critics of what can be done in a state: two, of which the lesser counts. Those of actions are learned from what came of them (implicit
+//! Q-learning, Kostrikov et al. 2022), beside one of the state itself, which is what the better ones of the data's actions are worth; those of
+//! skills as [`super::SkillTransitions`] says.
 //!
 //! A worth is a discounted mean of rewards in standard deviations of the data's returns, as everywhere ([`crate::model::config::Units`]).
 
 use crate::model::{
+    method::Method,
     nn::{Activations, Mlp, params::Params},
     trajectory::Layout,
 };
@@ -11,8 +13,31 @@ use candle_core::{Result, Tensor};
 
 /// See the module.
 pub struct Critic {
-    q: [Mlp; 2],
-    v: Mlp,
+    pub(super) q: [Mlp; 2],
+    /// None of skills: double Q-learning looks for the best of what is drawn.
+    v: Option<Mlp>,
+}
+
+/// What critics judge, and in which light.
+#[derive(Clone, Copy, Debug)]
+pub struct Judged {
+    /// Columns of a state.
+    pub state_dim: usize,
+    /// Columns of what is chosen: an action, or the code of a skill.
+    pub choice_dim: usize,
+    /// Width of the latent.
+    pub latent_dim: usize,
+    /// Whether the state is judged for itself too.
+    pub state_alone: bool,
+}
+
+impl Judged {
+    /// By the critics of a method.
+    pub fn of(layout: Layout, method: &Method) -> Self {
+        let code = method.plan.diffused.code_dim();
+        let choice_dim = if code > 0 { code } else { layout.action_dim };
+        Self { state_dim: layout.state_dim, choice_dim, latent_dim: method.latent.dim(), state_alone: code == 0 }
+    }
 }
 
 /// Transitions, normalized units: `(B, 1, ..)`.
@@ -46,17 +71,19 @@ pub struct CriticTerms {
 }
 
 impl Critic {
-    /// Networks `q1`, `q2` and `v` under `params`' scope.
+    /// Networks `q1`, `q2` and, where a state is judged for itself, `v` under `params`' scope.
     ///
     /// # Errors
     /// If a loaded parameter is missing or of another shape.
-    pub fn new(layout: Layout, latent_dim: usize, width: usize, params: &Params) -> Result<Self> {
+    pub fn new(judged: Judged, width: usize, params: &Params) -> Result<Self> {
         let net = |name: &str, d_in: usize| Mlp::new(d_in, width, 1, &params.scope(name));
-        let (of_state, of_action) = (layout.state_dim + latent_dim, layout.dim() + latent_dim);
-        Ok(Self { q: [net("q1", of_action)?, net("q2", of_action)?], v: net("v", of_state)? })
+        let of_state = judged.state_dim + judged.latent_dim;
+        let of_choice = of_state + judged.choice_dim;
+        let v = judged.state_alone.then(|| net("v", of_state)).transpose()?;
+        Ok(Self { q: [net("q1", of_choice)?, net("q2", of_choice)?], v })
     }
 
-    /// What actions are worth to either critic, `(B, 1, 1)`, from `(B, 1, state_dim)`, `(B, 1, action_dim)`, `(B, 1, latent_dim)`.
+    /// What actions are worth to either critic, `(B, T, 1)`, from `(B, T, state_dim)`, `(B, T, choice_dim)`, `(B, T, latent_dim)`.
     ///
     /// # Errors
     /// If widths differ.
@@ -71,11 +98,12 @@ impl Critic {
     /// What states are worth, `(B, 1, 1)`.
     ///
     /// # Errors
-    /// If widths differ.
+    /// If widths differ, or the critics are of skills.
     pub fn v<V: Activations>(&self, state: &V, latent: Option<&V>) -> Result<V> {
+        let Some(v) = &self.v else { candle_core::bail!("critics of skills judge no state for itself") };
         match latent {
-            Some(latent) => self.v.forward(&V::beside(&[state, latent])?),
-            None => self.v.forward(state),
+            Some(latent) => v.forward(&V::beside(&[state, latent])?),
+            None => v.forward(state),
         }
     }
 

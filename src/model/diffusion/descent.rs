@@ -118,6 +118,11 @@ impl Descent {
         self.guess_anew();
     }
 
+    /// Is that which an act before arrived at, and nothing is left to be evaluated.
+    pub fn hold(&mut self, given: &[f32]) {
+        self.given.extend_from_slice(given);
+    }
+
     /// Whether nothing is left to be evaluated.
     pub fn is_done(&self) -> bool {
         self.failed || self.actions_left() == 0

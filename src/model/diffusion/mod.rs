@@ -2,6 +2,7 @@
 //! the paper).
 mod at_once;
 pub mod descent;
+pub mod draw;
 pub mod guidance;
 mod hurry;
 pub mod inverse;

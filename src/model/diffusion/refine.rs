@@ -11,6 +11,7 @@ use crate::model::{
     Networks,
     columns::Columns,
     denoiser::Given,
+    head::Segments,
     latent::{Evidence, Gaussian, LatentModel, Past, Tokens},
     method::{Diffusion, Target},
     nn::Chance,
@@ -72,12 +73,14 @@ pub struct WindowBatch {
     /// Steps right before each window that the sampler would have imagined (`action_horizon > 1`); without any the state at position 0 is
     /// the real one, and inpainted. Where actions alone are diffused nobody imagines states: with any, that at position 0 is unknown.
     pub imagined: Vec<usize>,
-    /// `(B, T, state_dim + action_dim)` Gaussian draws.
+    /// `(B, T, state_dim + action_dim)` Gaussian draws; of a code `(B, 1, code_dim)`.
     pub noise: Tensor,
     /// `(B, 1, told_width + 1)` what each window is told of what is wanted, and 1, or zeros; of models that take it.
     pub told: Option<Tensor>,
     /// `(B, T, dim)` the true context of each position, of an oracle.
     pub truth: Option<Tensor>,
+    /// What is done from position 0 on, of a model whose plan is the code of it: that code then stands in the window's place.
+    pub segments: Option<Segments>,
     /// `(B, 1, 1)` discounted mean of the rewards from position 0 on, standard deviations of the data; of methods that ask for returns.
     pub returns: Option<Tensor>,
     /// Seed of what a network drops by chance; none where it drops nothing.
@@ -117,6 +120,7 @@ impl WindowBatch {
             noise: cut(&self.noise)?,
             told: self.told.as_ref().map(cut).transpose()?,
             truth: self.truth.as_ref().map(cut).transpose()?,
+            segments: self.segments.as_ref().map(|segments| segments.narrow(start, len)).transpose()?,
             returns: self.returns.as_ref().map(cut).transpose()?,
             // Parts of a batch have streams of their own.
             chance: self.chance.map(|seed| seed.wrapping_add(start as u64)),
@@ -173,6 +177,8 @@ impl Networks {
     /// # Errors
     /// If a shape differs from the configuration.
     pub fn refine_loss(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<RefineTerms> {
+        let coded = self.coded(batch)?;
+        let batch = coded.as_ref().unwrap_or(batch);
         let noised = Noised::new(plan, batch, options)?;
         let weights = loss_weights(plan, batch, options)?;
         let chance = batch.chance.map(Chance::new);
@@ -191,6 +197,13 @@ impl Networks {
         }
         let mean = |(sum, count): (f32, usize)| (if count == 0 { 0.0 } else { sum / count as f32 }, count);
         Ok(RefineTerms { loss, prior: mean(prior), posterior: mean(posterior) })
+    }
+
+    /// The batch with the codes of its segments in the place of its windows; none of a model whose plan is no code.
+    fn coded(&self, batch: &WindowBatch) -> Result<Option<WindowBatch>> {
+        let (Some(skill), Some(segments)) = (&self.skill, &batch.segments) else { return Ok(None) };
+        let all = batch.at.len();
+        Ok(Some(WindowBatch { window: skill.codes(segments)?, segments: None, ..batch.narrow(0, all)? }))
     }
 
     /// Mean square error of what the value network tells of a batch.
@@ -217,6 +230,8 @@ impl Networks {
     /// What the denoiser reads of a batch: x, levels, latents, real steps and what is told.
     #[cfg(test)]
     pub(crate) fn read_in_training(&self, plan: &Diffusion, batch: &WindowBatch, options: &RefineOptions) -> Result<[Vec<f32>; 5]> {
+        let coded = self.coded(batch)?;
+        let batch = coded.as_ref().unwrap_or(batch);
         let noised = Noised::new(plan, batch, options)?;
         let latents = self.route(batch, &noised, options.routing)?.remove(0).latents;
         let numbers = |tensor: Option<&Tensor>| tensor.map_or(Ok(Vec::new()), |tensor| tensor.flatten_all()?.to_vec1::<f32>());

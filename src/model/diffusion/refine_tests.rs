@@ -52,6 +52,7 @@ fn batch(window: Vec<f32>, noise: Vec<f32>, row: usize) -> WindowBatch {
         noise: tensor(noise),
         told: None,
         truth: None,
+        segments: None,
         returns: None,
         chance: None,
     }

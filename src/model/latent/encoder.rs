@@ -1,6 +1,6 @@
 //! Tokens to posterior: embeddings, GRU and Gaussian head (appendix A.4 of the paper: Stage 1 networks).
 
-use super::{Gaussian, Surprises, Tokens, gaussian::LOG_VAR};
+use super::{Gaussian, LOG_VAR, Surprises, Tokens};
 use crate::model::{
     method::{Actions, GruLatent},
     nn::{

@@ -1,6 +1,6 @@
 //! Prior and decoder (appendix A.4 of the paper: 2-layer MLPs).
 
-use super::{Gaussian, gaussian::LOG_VAR};
+use super::{Gaussian, LOG_VAR};
 use crate::model::{
     method::GruLatent,
     nn::{Activations, Linear, Mlp, params::Params},

@@ -3,16 +3,16 @@ mod baseline;
 pub mod elbo;
 mod encoder;
 mod evidence;
-mod gaussian;
 mod heads;
 mod tokens;
 
 pub use baseline::{Baseline, ContextFreeTerms, WHITENERS};
 pub use encoder::Encoder;
 pub use evidence::Evidence;
-pub use gaussian::{Gaussian, GaussianRef, LOG_VAR, hold_within};
 pub use heads::{Decoder, Prior, Told};
 pub use tokens::{Before, Surprises, Tokens};
+
+pub use crate::model::nn::gaussian::{Gaussian, GaussianRef, LOG_VAR, hold_within};
 
 use crate::model::{
     method::{Future, GruLatent},

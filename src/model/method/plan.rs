@@ -58,6 +58,13 @@ pub enum Diffused {
     State,
     /// The action alone: a policy (section 4.2 of the paper; Chi et al. 2023). The real steps up to the current state are told it beside.
     Action,
+    /// The code of a skill, which stands for the actions of several steps; the real steps are told it beside as to a policy.
+    Code {
+        /// Its width.
+        dim: usize,
+        /// Steps that it stands for (H); a session holds on to it as long.
+        steps: usize,
+    },
 }
 
 impl Diffused {
@@ -68,8 +75,32 @@ impl Diffused {
     /// The first position that is not wholly known.
     pub fn first_free(self) -> usize {
         match self {
-            Self::StateAction | Self::Action => 0,
+            Self::StateAction | Self::Action | Self::Code { .. } => 0,
             Self::State => 1,
+        }
+    }
+
+    /// Whether states are part of it. Where they are not the current one is told beside, and nobody imagines later ones.
+    pub fn has_states(self) -> bool {
+        match self {
+            Self::StateAction | Self::State => true,
+            Self::Action | Self::Code { .. } => false,
+        }
+    }
+
+    /// Width of a code; 0 where there is none.
+    pub fn code_dim(self) -> usize {
+        match self {
+            Self::StateAction | Self::State | Self::Action => 0,
+            Self::Code { dim, .. } => dim,
+        }
+    }
+
+    /// Steps that a code stands for, where it is one.
+    pub fn code_steps(self) -> Option<usize> {
+        match self {
+            Self::StateAction | Self::State | Self::Action => None,
+            Self::Code { steps, .. } => Some(steps),
         }
     }
 }
@@ -235,15 +266,16 @@ impl Diffusion {
             Diffused::StateAction => state_dim + action_dim,
             Diffused::State => state_dim,
             Diffused::Action => action_dim,
+            Diffused::Code { dim, .. } => dim,
         }
     }
 
     /// Real steps that the denoiser is given beside the window, and numbers of each: state and action of those before the current one, which
-    /// the window itself begins with; of a window of actions the current one too, whose action is zeros, and how long ago each of them was.
+    /// the window itself begins with; of a window without states the current one too, whose action is zeros, and how long ago each of them was.
     pub fn observed(&self, [state_dim, action_dim]: [usize; 2]) -> [usize; 2] {
-        match self.diffused {
-            Diffused::StateAction | Diffused::State => [self.obs_horizon.saturating_sub(1), state_dim + action_dim],
-            Diffused::Action => [self.obs_horizon, state_dim + action_dim + 1],
+        match self.diffused.has_states() {
+            true => [self.obs_horizon.saturating_sub(1), state_dim + action_dim],
+            false => [self.obs_horizon, state_dim + action_dim + 1],
         }
     }
 

@@ -14,6 +14,7 @@ mod buffer;
 mod candle_faults;
 pub mod conv1d;
 mod dropout;
+pub mod gaussian;
 pub mod gru;
 pub mod host;
 pub mod kernels;

@@ -96,7 +96,7 @@ pub struct LimitsConfig {
     pub message_bytes_max: usize,
     /// Acts of one ActBatch.
     pub act_batch_len_max: usize,
-    /// Steps that one act may be told of (`executed`); a model looks back on `block_len` of them at most.
+    /// Steps that one act may be told of (`executed`), and an open (`history`); a model looks back on `block_len` of them at most, or on all.
     pub executed_len_max: usize,
     /// Acts of one ActStream or WebSocket that are worked on at once; the next is read when one is answered.
     pub stream_acts_max: usize,

@@ -21,8 +21,9 @@ use std::time::Duration;
 type Checked<T> = Result<T, ServiceError>;
 
 pub fn open_request(request: pb::OpenSessionRequest) -> Checked<OpenRequest> {
-    let pb::OpenSessionRequest { model, seed, options, ttl_ms, request_id } = request;
-    Ok(OpenRequest { model, seed, options: options.map_or(Ok(OptionsPatch::default()), options_patch)?, ttl_ms, request_id })
+    let pb::OpenSessionRequest { model, seed, options, ttl_ms, request_id, history } = request;
+    let options = options.map_or(Ok(OptionsPatch::default()), options_patch)?;
+    Ok(OpenRequest { model, seed, options, ttl_ms, request_id, history: steps(history) })
 }
 
 pub fn reset_request(request: pb::ResetSessionRequest) -> ResetRequest {
@@ -149,13 +150,13 @@ pub fn act_request(request: pb::ActRequest, timeout: Option<Duration>, client: u
 
 fn observation(observation: pb::Observation) -> Checked<Observation> {
     let pb::Observation { state, executed, nothing_executed, context } = observation;
-    let executed = executed.into_iter().map(|pb::Executed { state, action, reward }| Executed {
-        state: state.map(vector),
-        action: action.map(vector),
-        reward,
-    });
     let context = context.map(|context| rows("observation.context", &context)).transpose()?;
-    Ok(Observation { state, executed: executed.collect(), nothing_executed, context })
+    Ok(Observation { state, executed: steps(executed), nothing_executed, context })
+}
+
+fn steps(steps: Vec<pb::Executed>) -> Vec<Executed> {
+    let step = |pb::Executed { state, action, reward }| Executed { state: state.map(vector), action: action.map(vector), reward };
+    steps.into_iter().map(step).collect()
 }
 
 fn vector(pb::Vector { values }: pb::Vector) -> Vec<f32> {

@@ -12,8 +12,8 @@ use std::time::Duration;
 use utoipa::{IntoParams, ToSchema};
 
 /// OpenSession.
-#[derive(Debug, Default, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields, default)]
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
 pub struct OpenBody {
     /// `name` or `name@digest`; absent: the default model.
     model: Option<String>,
@@ -27,6 +27,9 @@ pub struct OpenBody {
     ttl_ms: Option<u64>,
     /// The client's name for this request: while the session lives, the same again gives the same session.
     request_id: Option<String>,
+    /// Steps lived before the session, oldest first, on which the latent looks back; what is missing in them is unknown, and a step that tells
+    /// nothing is the border between two episodes. Refused where the model's `trained.sessions` is false.
+    history: Option<Vec<ExecutedBody>>,
 }
 
 /// Act.
@@ -138,10 +141,15 @@ pub enum View {
 
 impl From<OpenBody> for OpenRequest {
     fn from(body: OpenBody) -> Self {
-        let OpenBody { model, seed, options, ttl_ms, request_id } = body;
-        let (model, options) = (model.unwrap_or_default(), options.unwrap_or_default());
-        Self { model, seed, options, ttl_ms, request_id: request_id.unwrap_or_default() }
+        let OpenBody { model, seed, options, ttl_ms, request_id, history } = body;
+        let (model, options, request_id) = (model.unwrap_or_default(), options.unwrap_or_default(), request_id.unwrap_or_default());
+        Self { model, seed, options, ttl_ms, request_id, history: steps(history) }
     }
+}
+
+fn steps(steps: Option<Vec<ExecutedBody>>) -> Vec<Executed> {
+    let step = |ExecutedBody { state, action, reward }| Executed { state, action, reward };
+    steps.unwrap_or_default().into_iter().map(step).collect()
 }
 
 impl ActBody {
@@ -149,17 +157,11 @@ impl ActBody {
     pub fn into_request(self, session_id: String, client: u64) -> ActRequest {
         let Self { session_id: _, step, observation, deadline_ms, want_planned_states, episode } = self;
         let ObservationBody { state, executed, nothing_executed, context } = observation;
-        let step_of = |ExecutedBody { state, action, reward }| Executed { state, action, reward };
         ActRequest {
             session_id,
             step,
             episode,
-            observation: Observation {
-                state,
-                executed: executed.unwrap_or_default().into_iter().map(step_of).collect(),
-                nothing_executed: nothing_executed.unwrap_or(false),
-                context,
-            },
+            observation: Observation { state, executed: steps(executed), nothing_executed: nothing_executed.unwrap_or(false), context },
             deadline: deadline_ms.map(|ms| Duration::from_millis(ms.into())),
             timeout: None,
             want_planned_states: want_planned_states.unwrap_or(false),

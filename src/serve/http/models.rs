@@ -91,7 +91,7 @@ pub struct TrainedAnswer {
     action_horizons: Vec<usize>,
     sub_steps: Vec<usize>,
     missing: MissingAnswer,
-    /// Whether histories crossed from one episode into the next, so that a reset may keep them.
+    /// Whether histories crossed from one episode into the next, so that a reset may keep one, and an open bring one.
     sessions: bool,
 }
 

@@ -12,6 +12,7 @@ use crate::model::{
         refine::{Standing, WindowBatch},
         schedule::Table,
     },
+    head::Segments,
     method::{Diffused, Diffusion, Looks},
     noise::Philox,
     trajectory::Seen,
@@ -43,9 +44,9 @@ pub struct WindowShape {
 }
 
 impl WindowShape {
-    /// The last step of a window must lie in the episode.
+    /// The last step of a window, or of what a code stands for, must lie in the episode.
     pub fn places(&self, episodes: &[Episode]) -> Places {
-        Places::new(episodes, 0, self.plan.horizon)
+        Places::new(episodes, 0, self.plan.diffused.code_steps().unwrap_or(self.plan.horizon))
     }
 
     /// What is seen of each of the `past` steps before the window, and of more if the denoiser looks back on more; the last one first. Of
@@ -62,9 +63,9 @@ impl WindowShape {
         (0..past.max(looks_back)).map(seen).collect()
     }
 
-    /// Whether it imagines actions alone.
+    /// Whether it imagines no states.
     fn is_policy(&self) -> bool {
-        self.plan.diffused == Diffused::Action
+        !self.plan.diffused.has_states()
     }
 
     /// The real steps that the denoiser is given with a window: [`Diffusion::observed`].
@@ -183,6 +184,64 @@ pub fn transitions(episodes: &[Episode], places: &Places, shape: &WindowShape, r
     Ok(TransitionBatch { now: cut(&now, shape, rng)?, next: cut(&next, shape, rng)?, rewards, ended })
 }
 
+/// What came of skills at these places, (episode, first step): the segments, and where they led to.
+pub struct SkillBatch {
+    /// What was done; `eps` draws the codes.
+    pub segments: Segments,
+    /// Rewards, as episodes hold them: those of each step of a skill, one skill after the other.
+    pub rewards: Vec<f32>,
+    /// Whether the episode ended with the skill, by what happened.
+    pub ended: Vec<bool>,
+    /// States that they led to, `(B, 1, state_dim)`; where the episode ended, the last that is known.
+    pub next_state: Tensor,
+}
+
+/// The places where a skill of so many steps may begin: the state after it is known, or it ended the episode.
+pub fn skill_places(episodes: &[Episode], steps: usize) -> Vec<(usize, usize)> {
+    let of = |(index, episode): (usize, &Episode)| {
+        let count = (episode.len() + usize::from(episode.ended)).saturating_sub(steps);
+        (0..count).map(move |start| (index, start))
+    };
+    episodes.iter().enumerate().flat_map(of).collect()
+}
+
+/// What came of the skills at places of [`skill_places`], of so many steps; their codes will be so wide.
+///
+/// # Errors
+/// If an episode cannot be read.
+pub fn skills(episodes: &[Episode], places: &[(usize, usize)], [steps, dim]: [usize; 2], rng: &mut Philox) -> Result<SkillBatch> {
+    let (mut rewards, mut ended, mut states) = (Vec::new(), Vec::new(), Vec::new());
+    let places = || places.iter().map(|(episode, start)| (&episodes[*episode], *start));
+    for (episode, start) in places() {
+        (start..start + steps).try_for_each(|t| episode.reward(t).map(|reward| rewards.push(reward)))?;
+        ended.push(start + steps == episode.len());
+        states.extend_from_slice(&episode.state((start + steps).min(episode.len() - 1))?);
+    }
+    let count = ended.len();
+    let begins = places().map(|(episode, start)| (episode, start as isize));
+    let segments = segments(begins, steps, gaussian((count, 1, dim), rng)?)?;
+    let next_state = Tensor::from_vec(states, (count, 1, episodes[0].layout.state_dim), &Device::Cpu)?;
+    Ok(SkillBatch { segments, rewards, ended, next_state })
+}
+
+/// What the denoiser is given beside a window at the ends of skills at these places, as an act there has it; where the episode ended, that at the
+/// last step.
+///
+/// # Errors
+/// If an episode cannot be read.
+pub fn given_after(episodes: &[Episode], places: &[(usize, usize)], shape: &WindowShape, rng: &mut Philox) -> Result<WindowBatch> {
+    let steps = shape.plan.diffused.code_steps().unwrap_or(1);
+    // Of actions, which see what codes see, a window of one step is there wherever there is a step.
+    let plan = Diffusion { diffused: Diffused::Action, ..shape.plan.clone() };
+    let shape = WindowShape { plan, batch: places.len(), ..shape.clone() };
+    let at = |(episode, start): &(usize, usize)| {
+        let episode = &episodes[*episode];
+        ((episode.clone(), (start + steps).min(episode.len() - 1) as isize), (Standing::Row(0), 0))
+    };
+    let drawn: Vec<Drawn> = places.iter().map(at).map(|(place, standing)| shape.at(place, standing, rng)).collect();
+    cut(&drawn, &shape, rng)
+}
+
 /// Cuts windows from their episodes.
 fn cut(drawn: &[Drawn], shape: &WindowShape, rng: &mut Philox) -> Result<WindowBatch> {
     let layout = drawn[0].episode.layout;
@@ -193,7 +252,11 @@ fn cut(drawn: &[Drawn], shape: &WindowShape, rng: &mut Philox) -> Result<WindowB
         (one.start..one.start + horizon as isize).try_for_each(|t| push_step(&mut window, &one.episode, t, Seen::ALL))?;
     }
     let dims = (shape.batch, horizon, layout.dim());
-    let noise: Vec<f32> = (0..window.len()).map(|_| rng.normal()).collect();
+    let coded = shape.plan.diffused.code_steps();
+    let noise_dims = coded.map_or(dims, |_| (shape.batch, horizon, shape.plan.diffused.code_dim()));
+    let noise = gaussian(noise_dims, rng)?;
+    let places = drawn.iter().map(|drawn| (&drawn.episode, drawn.start));
+    let segments = coded.map(|steps| segments(places, steps, gaussian(noise_dims, rng)?)).transpose()?;
     let places = drawn.iter().map(|drawn| (&drawn.episode, drawn.start.unsigned_abs(), drawn.imagined));
     let BesideBatch { told, truth, returns } = shape.beside.of(places, horizon, rng)?;
     let chance = (shape.plan.backbone.dropout() > 0.0).then(|| u64::from(rng.bits()) << 32 | u64::from(rng.bits()));
@@ -208,12 +271,28 @@ fn cut(drawn: &[Drawn], shape: &WindowShape, rng: &mut Philox) -> Result<WindowB
         observed,
         at: drawn.iter().map(|drawn| drawn.standing.clone()).collect(),
         imagined: drawn.iter().map(|drawn| drawn.imagined).collect(),
-        noise: Tensor::from_vec(noise, dims, &Device::Cpu)?,
+        noise,
         told,
         truth,
+        segments,
         returns,
         chance,
     })
+}
+
+fn gaussian(dims: (usize, usize, usize), rng: &mut Philox) -> Result<Tensor> {
+    let draws: Vec<f32> = (0..dims.0 * dims.1 * dims.2).map(|_| rng.normal()).collect();
+    Tensor::from_vec(draws, dims, &Device::Cpu)
+}
+
+/// What is done in so many steps from the places on; `eps` draws the codes.
+fn segments<'a>(places: impl Iterator<Item = (&'a Episode, isize)>, steps: usize, eps: Tensor) -> Result<Segments> {
+    let (mut all, mut width) = (Vec::new(), 0);
+    for (episode, start) in places {
+        width = episode.layout.dim();
+        (start..start + steps as isize).try_for_each(|t| push_step(&mut all, episode, t, Seen::ALL))?;
+    }
+    Ok(Segments { steps: Tensor::from_vec(all, (eps.dim(0)?, steps, width), &Device::Cpu)?, eps })
 }
 
 #[cfg(test)]

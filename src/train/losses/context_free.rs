@@ -53,14 +53,13 @@ impl<'a> ContextFreeLoss<'a> {
         let batch = transitions(&self.episodes.train, &drawn)?;
         Ok(Box::new(move || {
             let terms = baseline(networks)?.loss(&batch, &self.task.config.units.normalizer.state_change_std)?;
-            let mean = |name, tensor: &Tensor| -> Result<Mean> { Ok(Mean { name, sum: f64::from(tensor.to_scalar::<f32>()?), count: 1 }) };
             let means = vec![
-                mean("context_free", &terms.loss)?,
-                mean("state_error", &terms.state_error)?,
-                mean("action_error", &terms.action_error)?,
-                mean("reward_error", &terms.reward_error)?,
+                Mean::of("context_free", &terms.loss)?,
+                Mean::of("state_error", &terms.state_error)?,
+                Mean::of("action_error", &terms.action_error)?,
+                Mean::of("reward_error", &terms.reward_error)?,
             ];
-            Ok(Part { grads: terms.loss.affine(self.weight, 0.0)?.backward()?, means })
+            Part::of(&terms.loss, self.weight, means)
         }))
     }
 

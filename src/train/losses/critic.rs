@@ -72,9 +72,7 @@ impl<'a> CriticLoss<'a> {
         let batch = transitions(&self.episodes.train, &self.places, &self.shape, rng)?;
         Ok(Box::new(move || {
             let CriticTerms { loss, q, v } = self.errors(networks, target, &batch)?;
-            let mean = |name, error: &Tensor| Ok::<_, anyhow::Error>(Mean { name, sum: f64::from(error.to_scalar::<f32>()?), count: 1 });
-            let means = vec![mean("q", &q)?, mean("v", &v)?];
-            Ok(Part { grads: loss.affine(self.weight, 0.0)?.backward()?, means })
+            Part::of(&loss, self.weight, vec![Mean::of("q", &q)?, Mean::of("v", &v)?])
         }))
     }
 
@@ -116,13 +114,13 @@ impl<'a> CriticLoss<'a> {
 const NO_CRITIC: &str = "a model without critics has no error of them: is a bug";
 
 /// From rewards to what having them for ever is worth, standard deviations of the data's returns.
-struct Worth {
+pub(super) struct Worth {
     reward: [f64; 2],
     returns: [f64; 2],
 }
 
 impl Worth {
-    fn of(task: &Task) -> Self {
+    pub(super) fn of(task: &Task) -> Self {
         let units = &task.config.units;
         let reward = &units.normalizer.reward;
         let returns = units.returns.as_ref().map_or([0.0, 1.0], |returns| [returns.mean[0], returns.std[0]]);
@@ -130,12 +128,12 @@ impl Worth {
     }
 
     /// Of a reward as episodes hold it.
-    fn of_reward(&self, reward: f32) -> f64 {
+    pub(super) fn of_reward(&self, reward: f32) -> f64 {
         self.of_raw(self.reward[0] + self.reward[1] * f64::from(reward))
     }
 
     /// Of one in units of the data: after an end there is none, which is 0.
-    fn of_raw(&self, reward: f64) -> f64 {
+    pub(super) fn of_raw(&self, reward: f64) -> f64 {
         (reward - self.returns[0]) / self.returns[1]
     }
 }
@@ -143,9 +141,8 @@ impl Worth {
 #[cfg(test)]
 mod tests {
     use crate::model::{
-        critic::{Critic, Transitions},
+        critic::{Critic, Judged, Transitions},
         nn::params::Params,
-        trajectory::Layout,
     };
     use crate::train::optimizer::{Adam, Ema};
     use candle_core::{Device, Tensor};
@@ -183,9 +180,9 @@ mod tests {
     /// Critics that learn from all four transitions, each as often, with the average of their weights as the slow copy, find those worths.
     #[test]
     fn critics_of_a_small_world_find_its_worths() {
-        let layout = Layout { state_dim: 2, action_dim: 1 };
+        let judged = Judged { state_dim: 2, choice_dim: 1, latent_dim: 0, state_alone: true };
         let params = Params::fresh(3);
-        let critic = Critic::new(layout, 0, 24, &params).unwrap();
+        let critic = Critic::new(judged, 24, &params).unwrap();
         let vars = params.vars();
         let (mut adam, mut ema) = (Adam::new(&vars, |_| Some(0), 0.0, f64::INFINITY), Ema::new(&vars, 0.98).unwrap());
         let (zero, one) = ([1.0, 0.0], [0.0, 1.0]);
@@ -204,7 +201,7 @@ mod tests {
             ended: &ended,
         };
         for step in 0..2500 {
-            let slow = Critic::new(layout, 0, 24, &Params::loaded(ema.tensors(&vars).unwrap())).unwrap();
+            let slow = Critic::new(judged, 24, &Params::loaded(ema.tensors(&vars).unwrap())).unwrap();
             let loss = critic.errors(&slow, &of, (DISCOUNT, TAU)).unwrap().loss;
             adam.step(&[loss.backward().unwrap()], &[3e-3]).unwrap();
             ema.update(&vars, step).unwrap();

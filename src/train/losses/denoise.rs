@@ -98,7 +98,7 @@ impl<'a> DenoiseLoss<'a> {
             mean("loss_prior", terms.prior.0, terms.prior.1),
             mean("loss_posterior", terms.posterior.0, terms.posterior.1),
         ];
-        Ok(Part { grads: terms.loss.affine(self.weight * share, 0.0)?.backward()?, means })
+        Part::of(&terms.loss, self.weight * share, means)
     }
 
     /// Denoising error of held-out windows at each row of the ladder, with the latents that the sampler has there.

@@ -4,7 +4,6 @@ use super::{Job, Mean, Part};
 use crate::model::{
     Networks,
     latent::elbo::{ElboBatch, ElboOptions},
-    method::Diffused,
     noise::Philox,
 };
 use crate::train::{
@@ -53,7 +52,7 @@ impl<'a> ElboLoss<'a> {
             context: (latent.tells > 0).then(|| task.context_units.clone()),
             show_action: config.show_action,
             show_reward: config.show_reward,
-            mask_state: if task.config.method.plan.diffused == Diffused::Action { MASKED } else { 0.0 },
+            mask_state: if task.config.method.plan.diffused.has_states() { 0.0 } else { MASKED },
             hide: task.recipe.hide,
         };
         let before = earlier.iter().filter(|stage| stage.weight(Loss::Elbo) > 0.0).map(|stage| stage.steps).sum();
@@ -75,7 +74,7 @@ impl<'a> ElboLoss<'a> {
         let kl_weight = self.config.kl_weight.at(self.before + step);
         Ok(Box::new(move || {
             let (loss, means) = self.evaluate(networks, &batch, kl_weight)?;
-            Ok(Part { grads: loss.affine(self.weight, 0.0)?.backward()?, means })
+            Part::of(&loss, self.weight, means)
         }))
     }
 
@@ -93,16 +92,15 @@ impl<'a> ElboLoss<'a> {
         };
         let latent = networks.latent.as_ref().context("the ELBO needs a latent model: is a bug")?;
         let terms = latent.elbo(batch, &options)?;
-        let mean = |name, tensor: &Tensor| -> Result<Mean> { Ok(Mean { name, sum: f64::from(tensor.to_scalar::<f32>()?), count: 1 }) };
         let mut means = vec![
-            mean("elbo", &terms.loss)?,
-            mean("state_error", &terms.state_error)?,
-            mean("reward_error", &terms.reward_error)?,
-            mean("kl", &terms.kl)?,
+            Mean::of("elbo", &terms.loss)?,
+            Mean::of("state_error", &terms.state_error)?,
+            Mean::of("reward_error", &terms.reward_error)?,
+            Mean::of("kl", &terms.kl)?,
         ];
-        means.extend(terms.action_error.as_ref().map(|error| mean("action_error", error)).transpose()?);
-        means.extend(terms.context_error.as_ref().map(|error| mean("context_error", error)).transpose()?);
-        means.extend(terms.ahead.as_ref().map(|error| mean("ahead", error)).transpose()?);
+        means.extend(terms.action_error.as_ref().map(|error| Mean::of("action_error", error)).transpose()?);
+        means.extend(terms.context_error.as_ref().map(|error| Mean::of("context_error", error)).transpose()?);
+        means.extend(terms.ahead.as_ref().map(|error| Mean::of("ahead", error)).transpose()?);
         Ok((terms.loss, means))
     }
 

@@ -70,8 +70,7 @@ impl<'a> InverseLoss<'a> {
         let drawn = self.draw(self.shape.batch, rng)?;
         Ok(Box::new(move || {
             let loss = self.loss(networks, &batch, drawn)?;
-            let means = vec![Mean { name: "inverse", sum: f64::from(loss.to_scalar::<f32>()?), count: 1 }];
-            Ok(Part { grads: loss.affine(self.weight, 0.0)?.backward()?, means })
+            Part::of(&loss, self.weight, vec![Mean::of("inverse", &loss)?])
         }))
     }
 
@@ -91,7 +90,7 @@ impl<'a> InverseLoss<'a> {
     fn steps(&self) -> usize {
         match self.task.config.method.head {
             Head::Inverse { latent: true, .. } => 1,
-            Head::Inverse { latent: false, .. } | Head::Direct => self.shape.plan.horizon - 1,
+            Head::Inverse { latent: false, .. } | Head::Direct | Head::Skill { .. } => self.shape.plan.horizon - 1,
         }
     }
 

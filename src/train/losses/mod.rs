@@ -4,8 +4,10 @@
 pub mod context_free;
 pub mod critic;
 pub mod denoise;
+pub mod double_q;
 pub mod elbo;
 pub mod inverse;
+pub mod skill;
 pub mod value;
 
 use super::{
@@ -20,12 +22,14 @@ use super::{
 };
 use crate::model::{Networks, critic::Critic, noise::Philox};
 use anyhow::Result;
-use candle_core::backprop::GradStore;
+use candle_core::{Tensor, backprop::GradStore};
 use context_free::ContextFreeLoss;
 use critic::CriticLoss;
 use denoise::DenoiseLoss;
+use double_q::DoubleQLoss;
 use elbo::ElboLoss;
 use inverse::InverseLoss;
+use skill::SkillLoss;
 use value::ValueLoss;
 
 /// A piece of a step's work, free to run on any thread.
@@ -37,6 +41,15 @@ struct Part {
     grads: GradStore,
     /// For the log.
     means: Vec<Mean>,
+    /// How far off places were that are drawn by that.
+    off: Vec<(usize, f32)>,
+}
+
+impl Part {
+    /// Gradients of `weight` times a loss.
+    fn of(loss: &Tensor, weight: f64, means: Vec<Mean>) -> Result<Self> {
+        Ok(Self { grads: loss.affine(weight, 0.0)?.backward()?, means, off: Vec::new() })
+    }
 }
 
 /// A number of the log, as a sum over `count` terms, so that the parts of a batch make one mean.
@@ -56,6 +69,15 @@ pub struct Objective<'a> {
     inverse: Option<InverseLoss<'a>>,
     value: Option<ValueLoss<'a>>,
     critic: Option<CriticLoss<'a>>,
+    skill: Option<SkillLoss<'a>>,
+    double_q: Option<DoubleQLoss<'a>>,
+}
+
+impl Mean {
+    /// Of one number.
+    fn of(name: &'static str, value: &Tensor) -> Result<Self> {
+        Ok(Self { name, sum: f64::from(value.to_scalar::<f32>()?), count: 1 })
+    }
 }
 
 impl<'a> Objective<'a> {
@@ -70,14 +92,20 @@ impl<'a> Objective<'a> {
             inverse: InverseLoss::of_stage(task, stage),
             value: ValueLoss::of_stage(task, stage),
             critic: CriticLoss::of_stage(task, stage),
+            skill: SkillLoss::of_stage(task, stage),
+            double_q: DoubleQLoss::of_stage(task, stage),
         }
     }
 
-    /// Finds out once how surprising every recorded step is, of a stage that leaves the baseline as it is: its batches then need not ask again.
+    /// Finds out once what does not change while the stage is at work, and its batches then need not ask again: how surprising every recorded step
+    /// is, of a stage that leaves the baseline as it is; which skills the prior has to offer, of one that asks what they are worth.
     ///
     /// # Errors
     /// If an episode cannot be read, the disk is full, or a tensor operation fails.
     pub fn prepared(mut self, networks: &Networks) -> Result<Self> {
+        if let Some(double_q) = &mut self.double_q {
+            double_q.look_for_offers(networks)?;
+        }
         let baseline = networks.latent.as_ref().and_then(|latent| latent.baseline.as_ref());
         let stays = !self.stage.trains.contains_key(&Group::Baseline);
         let windows =
@@ -99,9 +127,14 @@ impl<'a> Objective<'a> {
     pub fn step(&self, learner: &mut Learner) -> Result<Scalars> {
         let step = learner.position.step;
         let mut rng = learner.position.stream(self.task.recipe.seed);
-        let slow = self.critic.as_ref().map(|_| learner.slow_critic(self.task)).transpose()?.flatten();
-        let jobs = self.jobs(&learner.networks, slow.as_ref(), step, &mut rng)?;
+        let judges = self.critic.is_some() || self.double_q.is_some();
+        let slow = judges.then(|| learner.slow_critic(self.task)).transpose()?.flatten();
+        if let Some(double_q) = self.double_q.as_ref().filter(|_| learner.priorities.is_empty()) {
+            learner.priorities = double_q.first_priorities();
+        }
+        let jobs = self.jobs(learner, slow.as_ref(), step, &mut rng)?;
         let parts = side_by_side(jobs).into_iter().collect::<Result<Vec<Part>>>()?;
+        parts.iter().flat_map(|part| &part.off).for_each(|(place, off)| learner.priorities[*place] = *off);
         let mut scalars = means(&parts);
         let grads: Vec<GradStore> = parts.into_iter().map(|part| part.grads).collect();
         let rate = self.stage.learning_rate.at(step, self.stage.steps);
@@ -115,8 +148,8 @@ impl<'a> Objective<'a> {
     }
 
     /// The work of a step; batches are drawn here, in the order of [`super::recipe::losses::Loss`].
-    fn jobs<'b>(&'b self, networks: &'b Networks, slow: Option<&'b Critic>, step: usize, rng: &mut Philox) -> Result<Vec<Job<'b>>> {
-        let mut jobs = Vec::new();
+    fn jobs<'b>(&'b self, learner: &'b Learner, slow: Option<&'b Critic>, step: usize, rng: &mut Philox) -> Result<Vec<Job<'b>>> {
+        let (networks, mut jobs) = (&learner.networks, Vec::new());
         if let Some(denoise) = &self.denoise {
             jobs.extend(denoise.jobs(networks, rng)?);
         }
@@ -134,6 +167,12 @@ impl<'a> Objective<'a> {
         }
         if let (Some(critic), Some(slow)) = (&self.critic, slow) {
             jobs.push(critic.job(networks, slow, rng)?);
+        }
+        if let Some(skill) = &self.skill {
+            jobs.push(skill.job(networks, rng)?);
+        }
+        if let (Some(double_q), Some(slow)) = (&self.double_q, slow) {
+            jobs.push(double_q.job(networks, slow, &learner.priorities, rng)?);
         }
         Ok(jobs)
     }
@@ -163,6 +202,12 @@ impl<'a> Objective<'a> {
         if let Some(critic) = &self.critic {
             scalars.push(("held_out_critic", critic.held_out(networks)?));
         }
+        if let Some(skill) = &self.skill {
+            scalars.push(("held_out_skill", skill.held_out(networks)?));
+        }
+        if let Some(double_q) = &self.double_q {
+            scalars.push(("held_out_double_q", double_q.held_out(networks)?));
+        }
         Ok(scalars)
     }
 
@@ -183,6 +228,8 @@ impl<'a> Objective<'a> {
             Loss::Inverse => "held_out_inverse",
             Loss::Value => "held_out_value",
             Loss::Critic => "held_out_critic",
+            Loss::Skill => "held_out_skill",
+            Loss::DoubleQ => "held_out_double_q",
         };
         let weighted = |(loss, weight): (&Loss, &f64)| {
             let found = held_out.iter().find(|(name, _)| *name == of(loss))?;

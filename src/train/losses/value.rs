@@ -59,8 +59,7 @@ impl<'a> ValueLoss<'a> {
         let batch = self.draw(&self.episodes.train, &self.places, &self.shape, rng)?;
         Ok(Box::new(move || {
             let loss = networks.value_loss(&self.task.config.method.plan, &batch, &self.options)?;
-            let means = vec![Mean { name: "value", sum: f64::from(loss.to_scalar::<f32>()?), count: 1 }];
-            Ok(Part { grads: loss.affine(self.weight, 0.0)?.backward()?, means })
+            Part::of(&loss, self.weight, vec![Mean::of("value", &loss)?])
         }))
     }
 

@@ -10,6 +10,8 @@ use serde::{Deserialize, Serialize};
 
 /// Rows of one batch.
 const BATCH_MAX: usize = 65_536;
+/// Skills that are offered in a state.
+const CANDIDATES_MAX: usize = 1024;
 /// Steps of a block of the ELBO.
 const LENGTH_MAX: usize = 65_536;
 
@@ -29,6 +31,10 @@ pub enum Loss {
     Value,
     /// [`CriticConfig`].
     Critic,
+    /// [`SkillConfig`].
+    Skill,
+    /// [`DoubleQConfig`].
+    DoubleQ,
 }
 
 impl Loss {
@@ -41,6 +47,8 @@ impl Loss {
             Self::Inverse => "inverse",
             Self::Value => "value",
             Self::Critic => "critic",
+            Self::Skill => "skill",
+            Self::DoubleQ => "double_q",
         }
     }
 }
@@ -59,8 +67,37 @@ pub struct Losses {
     pub inverse: Option<InverseConfig>,
     /// What windows are worth; absent for models without a value network.
     pub value: Option<ValueConfig>,
-    /// What actions are worth; absent for models without critics.
+    /// What actions are worth; absent for models without critics of them.
     pub critic: Option<CriticConfig>,
+    /// What codes of skills stand for; absent for models whose plan is no code.
+    pub skill: Option<SkillConfig>,
+    /// What skills are worth; absent for models without critics of them.
+    pub double_q: Option<DoubleQConfig>,
+}
+
+/// Errors of the autoencoder of skills ([`crate::model::method::Head::Skill`]).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SkillConfig {
+    /// Segments in a batch.
+    pub batch: usize,
+    /// Weight of the KL; 1 is the evidence lower bound.
+    pub beta: f64,
+}
+
+/// Errors of double Q-learning on what came of skills ([`crate::model::method::Guide::Critic`]). The slow copy is the average of the stage, as of
+/// [`CriticConfig`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DoubleQConfig {
+    /// Skills in a batch.
+    pub batch: usize,
+    /// Skills that the prior offers in each next state; they are drawn once, before the stage.
+    pub candidates: usize,
+    /// How much more often what was far off is drawn (alpha of prioritised replay, Schaul et al. 2016); 0 draws all alike.
+    pub priority: f64,
+    /// How far its weight takes that back (beta); 1 does so wholly.
+    pub importance: f64,
 }
 
 /// Errors of implicit Q-learning on transitions ([`crate::model::method::Guide::Critic`]). The slow copy that they are drawn to is the average of the
@@ -249,12 +286,14 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
 
 /// Networks beside the planner have losses, and losses networks.
 fn check_heads(recipe: &Recipe) -> Result<(), RecipeError> {
-    let model = &recipe.model;
+    let (model, coded) = (&recipe.model, recipe.model.plan.diffused.code_steps().is_some());
     let used = |loss: Loss| recipe.stages.iter().any(|stage| stage.weight(loss) > 0.0);
     for (loss, there, asked, network) in [
         (Loss::Inverse, recipe.losses.inverse.is_some(), model.head.is_inverse(), "model.head of kind inverse"),
         (Loss::Value, recipe.losses.value.is_some(), model.has_value(), "model.guide of kind value"),
-        (Loss::Critic, recipe.losses.critic.is_some(), model.has_critic(), "model.guide of kind critic"),
+        (Loss::Critic, recipe.losses.critic.is_some(), model.has_critic() && !coded, "model.guide of kind critic, of actions"),
+        (Loss::Skill, recipe.losses.skill.is_some(), coded, "model.plan.diffused of kind code"),
+        (Loss::DoubleQ, recipe.losses.double_q.is_some(), model.has_critic() && coded, "model.guide of kind critic, of skills"),
     ] {
         let key = format!("losses.{}", loss.name());
         require(there || !asked, &key, format!("is missing, but {network} asks for it"))?;
@@ -272,11 +311,21 @@ fn check_heads(recipe: &Recipe) -> Result<(), RecipeError> {
         between("losses.critic.batch", critic.batch, 1..=BATCH_MAX)?;
         let inside = critic.expectile > 0.0 && critic.expectile < 1.0;
         require(inside, "losses.critic.expectile", format!("is {}, must lie between 0 and 1", critic.expectile))?;
-        let mut stages = recipe.stages.iter().filter(|stage| stage.weight(Loss::Critic) > 0.0);
-        let swift = stages.find(|stage| stage.ema_decay_max.is_none());
-        let key = swift.map_or(String::new(), |stage| format!("stages.{}.ema_decay_max", stage.name));
-        require(swift.is_none(), key, "is missing: the average of the stage is the slow copy that critics are drawn to")?;
     }
+    if let Some(skill) = &recipe.losses.skill {
+        between("losses.skill.batch", skill.batch, 1..=BATCH_MAX)?;
+        between("losses.skill.beta", skill.beta, WEIGHTS)?;
+    }
+    if let Some(double_q) = &recipe.losses.double_q {
+        between("losses.double_q.batch", double_q.batch, 1..=BATCH_MAX)?;
+        between("losses.double_q.candidates", double_q.candidates, 1..=CANDIDATES_MAX)?;
+        between("losses.double_q.priority", double_q.priority, 0.0..=1.0)?;
+        between("losses.double_q.importance", double_q.importance, 0.0..=1.0)?;
+    }
+    let mut critics = recipe.stages.iter().filter(|stage| stage.weight(Loss::Critic) > 0.0 || stage.weight(Loss::DoubleQ) > 0.0);
+    let swift = critics.find(|stage| stage.ema_decay_max.is_none());
+    let key = swift.map_or(String::new(), |stage| format!("stages.{}.ema_decay_max", stage.name));
+    require(swift.is_none(), key, "is missing: the average of the stage is the slow copy that critics are drawn to")?;
     between("losses.denoise.told_hidden", recipe.losses.denoise.told_hidden, 0.0..=1.0)
 }
 

@@ -11,7 +11,7 @@ use crate::model::{
     checkpoint::{NAME_LEN_MAX, is_name},
     config::{Defaults, ModelConfig, Restart, Trained, Units},
     diffusion::refine::LatentRouting,
-    method::{Diffused, LatentSource, Method, Schedule, Told},
+    method::{LatentSource, Method, Schedule, Told},
     normalizer::Affine,
     options::SamplerOptions,
     trajectory::Layout,
@@ -171,7 +171,7 @@ impl Recipe {
         let key = |stage: &Stage| match (&stage.gate, stage.keeps) {
             (Some(_), _) => Some(format!("stages.{}.gate", stage.name)),
             (None, Keeps::LeastProbe(_)) => Some(format!("stages.{}.keeps", stage.name)),
-            (None, Keeps::Last | Keeps::LeastHeldOut(_)) => None,
+            (None, Keeps::Last | Keeps::Average | Keeps::LeastHeldOut(_)) => None,
         };
         self.stages.iter().find_map(key)
     }
@@ -184,8 +184,9 @@ impl Recipe {
     /// Steps an episode must have, and the keys that ask for them.
     pub fn episode_len_min(&self) -> (usize, String) {
         let window = (self.model.plan.horizon, "`model.plan.horizon`".to_string());
+        let skill = self.model.plan.diffused.code_steps().map(|steps| (steps + 1, "`model.plan.diffused.code.steps` + 1".to_string()));
         let block = self.losses.elbo.as_ref().map(|elbo| (elbo.length + 1, "`losses.elbo.length` + 1".to_string()));
-        block.into_iter().fold(window, |most, other| if other.0 > most.0 { other } else { most })
+        block.into_iter().chain(skill).fold(window, |most, other| if other.0 > most.0 { other } else { most })
     }
 
     /// What is shipped must be a model that loads ([`ModelConfig::check`]); the rest is training's own.
@@ -202,7 +203,7 @@ impl Recipe {
         let room = NAME_LEN_MAX.saturating_sub(format!("-seed{}", self.seed).len());
         let named = is_name(&self.name) && self.name.len() <= room;
         require(named, "name", format!("{:?} must be 1 to {room} of A-Z a-z 0-9 _ . -, as the server serves it by this name", self.name))?;
-        let least = if self.model.plan.diffused == Diffused::Action { 1 } else { 2 };
+        let least = if self.model.plan.diffused.has_states() { 2 } else { 1 };
         let reason = format!("must be at least {least}: a plan that ends where it begins says nothing");
         require(self.model.plan.horizon >= least, "model.plan.horizon", reason)?;
         for (key, value) in [("checkpoint_every", self.checkpoint_every), ("log_every", self.log_every)] {

@@ -23,13 +23,15 @@ pub enum Group {
     Inverse,
     /// What judges windows.
     Guide,
-    /// What judges actions.
+    /// What judges actions, or skills.
     Critic,
+    /// What skills stand for.
+    Skill,
 }
 
 impl Group {
     /// All of them.
-    pub const ALL: [Self; 6] = [Self::Baseline, Self::Latent, Self::Denoiser, Self::Inverse, Self::Guide, Self::Critic];
+    pub const ALL: [Self; 7] = [Self::Baseline, Self::Latent, Self::Denoiser, Self::Inverse, Self::Guide, Self::Critic, Self::Skill];
 
     /// As recipes spell it.
     pub fn name(self) -> &'static str {
@@ -40,6 +42,7 @@ impl Group {
             Self::Inverse => "inverse",
             Self::Guide => "guide",
             Self::Critic => "critic",
+            Self::Skill => "skill",
         }
     }
 
@@ -52,6 +55,7 @@ impl Group {
             Self::Inverse => "inverse.",
             Self::Guide => "guide.",
             Self::Critic => "critic.",
+            Self::Skill => "skill.",
         }
     }
 
@@ -69,7 +73,9 @@ impl Group {
             Self::Denoiser => loss == Loss::Denoise,
             Self::Inverse => loss == Loss::Inverse,
             Self::Guide => loss == Loss::Value,
-            Self::Critic => loss == Loss::Critic,
+            Self::Critic => matches!(loss, Loss::Critic | Loss::DoubleQ),
+            // A code is a fact for the prior and the critics.
+            Self::Skill => loss == Loss::Skill,
         }
     }
 }
@@ -109,6 +115,8 @@ pub enum Keeps {
     /// Those of its last step.
     #[default]
     Last,
+    /// Their average over the stage, as a checkpoint holds it: for stages that build on what this one made.
+    Average,
     /// Measured every so many steps: the ones with the least loss on held-out episodes.
     LeastHeldOut(usize),
     /// Measured every so many steps: the ones from which a linear probe finds `infos/context` best, on held-out episodes and without the
@@ -124,7 +132,7 @@ impl Keeps {
     /// Whether weights are measured after `step` of `steps`.
     pub fn is_due(self, step: usize, steps: usize) -> bool {
         match self {
-            Self::Last => false,
+            Self::Last | Self::Average => false,
             Self::LeastHeldOut(every) | Self::LeastProbe(every) => step.is_multiple_of(every) || step == steps,
         }
     }
@@ -158,6 +166,8 @@ impl Stage {
                 Loss::Inverse => recipe.losses.inverse.is_some(),
                 Loss::Value => recipe.losses.value.is_some(),
                 Loss::Critic => recipe.losses.critic.is_some(),
+                Loss::Skill => recipe.losses.skill.is_some(),
+                Loss::DoubleQ => recipe.losses.double_q.is_some(),
             };
             require(*weight == 0.0 || there, key(&format!("minimizes.{}", loss.name())), format!("needs [losses.{}]", loss.name()))?;
         }
@@ -170,7 +180,8 @@ impl Stage {
                 Group::Baseline => require(recipe.model.latent.baseline().is_some(), &key, "needs model.latent.baseline")?,
                 Group::Inverse => require(recipe.losses.inverse.is_some(), &key, "needs model.head of kind inverse")?,
                 Group::Guide => require(recipe.losses.value.is_some(), &key, "needs model.guide of kind value")?,
-                Group::Critic => require(recipe.losses.critic.is_some(), &key, "needs model.guide of kind critic")?,
+                Group::Critic => require(recipe.model.has_critic(), &key, "needs model.guide of kind critic")?,
+                Group::Skill => require(recipe.losses.skill.is_some(), &key, "needs model.plan.diffused of kind code")?,
             }
             let reached = self.minimizes.iter().any(|(loss, weight)| *weight > 0.0 && group.is_reached_by(*loss));
             require(reached, &key, "is not reached by any loss that this stage minimizes")?;
@@ -188,6 +199,7 @@ impl Stage {
         require(self.ema_decay_max.is_none_or(|decay| (0.0..1.0).contains(&decay)), key("ema_decay_max"), "must lie in 0..1")?;
         match self.keeps {
             Keeps::Last => {}
+            Keeps::Average => require(self.ema_decay_max.is_some(), key("ema_decay_max"), "is missing: there is no average to hand on")?,
             Keeps::LeastHeldOut(every) => between(key("keeps.least_held_out"), every, 1..=usize::MAX)?,
             Keeps::LeastProbe(every) => {
                 between(key("keeps.least_probe"), every, 1..=usize::MAX)?;
@@ -234,14 +246,19 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
     }
     let Some(last) = last else { return require(false, "stages", "are missing: at least one must minimize denoise") };
     let key = |field: &str| format!("stages.{}.{field}", last.name);
-    require(last.weight(Loss::Denoise) > 0.0, key("minimizes.denoise"), "must be above 0 in the last stage, whose weights are shipped")?;
+    check_order(recipe)?;
+    let ships = last.weight(Loss::Denoise) > 0.0 || last.weight(Loss::DoubleQ) > 0.0;
+    require(ships, key("minimizes.denoise"), "must be above 0 in the last stage, whose weights are shipped")?;
     let learns = |group: Group| recipe.stages.iter().any(|stage| stage.trains.get(&group).is_some_and(|factor| *factor > 0.0));
     require(learns(Group::Denoiser), "stages", "train no denoiser, and a checkpoint of random weights would be shipped")?;
     require(recipe.model.latent.gru().is_none() || learns(Group::Latent), "stages", "train no latent, but model.latent asks for it")?;
     let model = &recipe.model;
-    for (group, asked) in
-        [(Group::Inverse, model.head.is_inverse()), (Group::Guide, model.has_value()), (Group::Critic, model.has_critic())]
-    {
+    for (group, asked) in [
+        (Group::Inverse, model.head.is_inverse()),
+        (Group::Guide, model.has_value()),
+        (Group::Critic, model.has_critic()),
+        (Group::Skill, model.plan.diffused.code_steps().is_some()),
+    ] {
         require(
             !asked || learns(group),
             "stages",
@@ -254,4 +271,22 @@ pub fn check(recipe: &Recipe) -> Result<(), RecipeError> {
         "must be last in the last stage: `--keep-best` ships its best weights beside the last",
     )?;
     require(last.gate.is_none(), key("gate"), "opens the way to another stage, and this is the last")
+}
+
+/// Where skills are, one stage builds on the other: codes, then the prior of them, then what those that it offers are worth; each on the average
+/// that the one before hands on, which is what is shipped.
+fn check_order(recipe: &Recipe) -> Result<(), RecipeError> {
+    let first = |loss: Loss| recipe.stages.iter().position(|stage| stage.weight(loss) > 0.0);
+    let ends = |loss: Loss| recipe.stages.iter().rposition(|stage| stage.weight(loss) > 0.0);
+    for (loss, needs) in [(Loss::Denoise, Loss::Skill), (Loss::DoubleQ, Loss::Denoise)] {
+        let (Some(begins), Some(built)) = (first(loss), ends(needs)) else { continue };
+        let key = format!("stages.{}", recipe.stages[begins].name);
+        let reason =
+            format!("minimizes {} and must come after the last stage that minimizes {}, on which it builds", loss.name(), needs.name());
+        require(built < begins, &key, reason)?;
+        let stage = &recipe.stages[built];
+        let reason = "must be average where the stage has one: it is what is shipped, and what the next stage is to build on";
+        require(stage.ema_decay_max.is_none() || stage.keeps == Keeps::Average, format!("stages.{}.keeps", stage.name), reason)?;
+    }
+    Ok(())
 }

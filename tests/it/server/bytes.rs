@@ -36,7 +36,7 @@ fn request_json(id: &str, seed: usize, step: u64) -> Value {
 }
 
 /// Everything numeric in an answer, by its bits.
-fn bits(answer: &pb::ActResponse) -> Vec<u32> {
+pub fn bits(answer: &pb::ActResponse) -> Vec<u32> {
     let floats = [
         &answer.actions.as_ref().unwrap().values,
         &answer.planned_states.as_ref().unwrap().values,
@@ -48,7 +48,7 @@ fn bits(answer: &pb::ActResponse) -> Vec<u32> {
     floats.chain([answer.evaluations, answer.passes, answer.start as u32, answer.renoised_rungs]).collect()
 }
 
-fn bits_json(answer: &Value) -> Vec<u32> {
+pub fn bits_json(answer: &Value) -> Vec<u32> {
     fn collect(value: &Value, bits: &mut Vec<u32>) {
         match value {
             Value::Array(values) => values.iter().for_each(|value| collect(value, bits)),

@@ -38,7 +38,7 @@ pub fn fresh(adjust: impl FnOnce(&mut ModelConfig)) -> tempfile::TempDir {
     dir
 }
 
-async fn serve(dir: &tempfile::TempDir) -> Running {
+pub async fn serve(dir: &tempfile::TempDir) -> Running {
     start(|config| {
         config.models.dir = dir.path().to_owned();
         config.models.default = "fresh".to_owned();
@@ -63,7 +63,7 @@ async fn open(server: &Running, grpc: pb::SamplerOptions, http: Value) -> Result
 }
 
 /// Field and reason of what both faces refuse.
-fn alike(grpc: &Status, http: &Reply, word: &str) -> (String, String) {
+pub fn alike(grpc: &Status, http: &Reply, word: &str) -> (String, String) {
     assert_eq!((failure(grpc), (http.status, http.reason().as_str())), ((Code::InvalidArgument, word.into()), (400, word)), "{grpc:?}");
     let (field, problem) = (trailer(grpc, "ada-field").unwrap(), http.json());
     assert_eq!((problem["field"].as_str(), problem["detail"].as_str()), (Some(field.as_str()), Some(grpc.message())));

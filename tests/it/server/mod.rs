@@ -7,6 +7,7 @@ mod engine;
 mod errors;
 mod frames;
 mod generator;
+mod history;
 mod hold;
 mod late;
 mod lifecycle;

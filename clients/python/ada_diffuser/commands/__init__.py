@@ -9,9 +9,12 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ada_diffuser.errors import AdaError
+
+if TYPE_CHECKING:
+    from ada_diffuser.rollout.warm_start import WarmStart
 
 DEFAULT_URL = "127.0.0.1:7777"
 _ENV_HELP = "short name, as point-wind-s (a wrong one lists them all), Gymnasium id, or MODULE:ID to import it from"
@@ -33,6 +36,24 @@ def add_trial_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--withhold-rewards", action="store_true", help="do not report rewards: what is the model worth where nobody measures them?"
     )
+    parser.add_argument(
+        "--warm-start",
+        metavar="FILE[:EPISODE]",
+        help="open each session with the steps of this episode of a data set (default: its last), on which the latent looks back; the model"
+        " must be trained on sessions, and the steps should be of the hidden context that it is to meet",
+    )
+
+
+def warm_start(arguments: argparse.Namespace) -> WarmStart | None:
+    """What `--warm-start` names, read. Raises `ValueError`, before a server is waited for."""
+    if arguments.warm_start is None:
+        return None
+    from ada_diffuser.rollout.warm_start import WarmStart
+
+    try:
+        return WarmStart.parse(arguments.warm_start)
+    except (OSError, KeyError) as error:
+        raise ValueError(f"--warm-start {arguments.warm_start}: is no data set of ada-collect: {error}") from None
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ada_diffuser.client import Client
-from ada_diffuser.commands import check_environment, environment_options, parse_settings
+from ada_diffuser.commands import check_environment, environment_options, parse_settings, warm_start
 from ada_diffuser.commands.outputs import check_output, save_json
 from ada_diffuser.commands.programs import Programs, defaults_line
 from ada_diffuser.commands.progress import progress
@@ -18,6 +18,7 @@ from ada_diffuser.commands.variants import served
 if TYPE_CHECKING:
     from ada_diffuser.rollout import Evaluation
     from ada_diffuser.rollout.choice import Choice, Facts, Setting, Tried
+    from ada_diffuser.rollout.warm_start import WarmStart
 
 #: Validation episodes: nothing is reported on them. The tables of models/README.md are of seeds from 1000 on.
 FIRST_SEED = 5000
@@ -35,13 +36,13 @@ def run(arguments: argparse.Namespace) -> None:
     from ada_diffuser.rollout.choice import Facts, decide, grid, race
     from ada_diffuser.rollout.report import choice_table
 
-    programs = Programs.find(arguments.programs)
+    programs, begins_with = Programs.find(arguments.programs), warm_start(arguments)
     inspected = programs.inspect(arguments.choose)
     facts = Facts.of(inspected["config"])
     settings = grid(parse_settings(arguments.set), facts)
     variants = list(dict.fromkeys(_restart(setting, facts) for setting in settings))
     with served(programs, arguments.choose, variants) as client:
-        runner = _Runner(arguments, client, {setting: str(variants.index(_restart(setting, facts))) for setting in settings})
+        runner = _Runner(arguments, client, {setting: str(variants.index(_restart(setting, facts))) for setting in settings}, begins_with)
         runner.check()
         choice = decide(race(settings, arguments.episodes, runner.play))
     keys, out = choice.chosen.setting.overrides(), arguments.write or Path(f"{arguments.choose}-chosen")
@@ -79,8 +80,8 @@ def _restart(setting: Setting, facts: Facts) -> tuple[str, ...]:
 class _Runner:
     """Plays settings through the server, and says so."""
 
-    def __init__(self, arguments: argparse.Namespace, client: Client, models: Mapping[Setting, str]) -> None:
-        self.arguments, self.client, self.models = arguments, client, models
+    def __init__(self, arguments: argparse.Namespace, client: Client, models: Mapping[Setting, str], begins_with: WarmStart | None) -> None:
+        self.arguments, self.client, self.models, self.begins_with = arguments, client, models, begins_with
         self.steps_max = 0
 
     def check(self) -> None:
@@ -115,6 +116,7 @@ class _Runner:
             asked.episode_steps,
             withhold_rewards=asked.withhold_rewards,
             env_options=environment_options(asked.env_option),
+            warm_start=self.begins_with,
         )
 
 

@@ -20,6 +20,7 @@ from ada_diffuser.commands import (
     parse_settings,
     run_command,
     server_url,
+    warm_start,
 )
 from ada_diffuser.commands.outputs import check_output, save_json
 from ada_diffuser.commands.progress import progress
@@ -139,6 +140,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     if len(models) > 1 and not all(models):
         raise ValueError(f"--models {arguments.models!r} has an empty name")
     check_environment(arguments)
+    begins_with = warm_start(arguments)
     from ada_diffuser.rollout import Trial
 
     trials = [
@@ -154,6 +156,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
             session_episodes=arguments.session_episodes,
             forget=arguments.forget,
             env_options=environment_options(arguments.env_option),
+            warm_start=begins_with,
         )
         for model in models
         for options in settings

@@ -19,6 +19,7 @@ from ada_diffuser.commands import (
     parse_settings,
     run_command,
     server_url,
+    warm_start,
 )
 from ada_diffuser.commands.outputs import check_output, save_json
 from ada_diffuser.commands.progress import progress
@@ -83,6 +84,7 @@ def _run(arguments: argparse.Namespace) -> None:
         arguments.episode_steps,
         withhold_rewards=arguments.withhold_rewards,
         env_options=environment_options(arguments.env_option),
+        warm_start=warm_start(arguments),
     )
     trials = [first, *(replace(first, model=model) for model in arguments.beside)]
     with Client(server_url(arguments.url, arguments.face)) as client:

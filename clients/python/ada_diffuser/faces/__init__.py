@@ -10,15 +10,13 @@ from typing import Protocol
 from urllib.parse import urlsplit
 
 from ada_diffuser.errors import AdaError
-from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary
+from ada_diffuser.messages import ActCall, Chunk, Model, OpenCall, SessionSummary
 
 
 class Face(Protocol):
     """The verbs. `timeout_s` bounds each call on this side, from the connecting to the last byte of the answer."""
 
-    def open_session(
-        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, request_id: str, timeout_s: float
-    ) -> tuple[SessionSummary, Model]: ...
+    def open_session(self, call: OpenCall, timeout_s: float) -> tuple[SessionSummary, Model]: ...
 
     def act(self, call: ActCall, timeout_s: float) -> Chunk: ...
 

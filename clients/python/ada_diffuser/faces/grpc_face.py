@@ -13,8 +13,10 @@ from ada_diffuser.faces.proxy import Proxy
 from ada_diffuser.messages import (
     ActCall,
     Chunk,
+    ExecutedValues,
     Missing,
     Model,
+    OpenCall,
     Returns,
     SamplerOptions,
     SessionSummary,
@@ -55,10 +57,15 @@ class GrpcFace:
         self._agent = agent_pb2_grpc.AgentStub(self._channel)  # type: ignore[no-untyped-call]
         self._models = models_pb2_grpc.ModelsStub(self._channel)  # type: ignore[no-untyped-call]
 
-    def open_session(
-        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, request_id: str, timeout_s: float
-    ) -> tuple[SessionSummary, Model]:
-        request = agent_pb2.OpenSessionRequest(model=model, seed=seed, options=_options_out(options), ttl_ms=ttl_ms, request_id=request_id)
+    def open_session(self, call: OpenCall, timeout_s: float) -> tuple[SessionSummary, Model]:
+        request = agent_pb2.OpenSessionRequest(
+            model=call.model,
+            seed=call.seed,
+            options=_options_out(call.options),
+            ttl_ms=call.ttl_ms,
+            request_id=call.request_id,
+            history=map(_executed, call.history),
+        )
         answer = self._call(self._agent.OpenSession, request, timeout_s)
         return _summary(answer.session), _model(answer.model)
 
@@ -149,18 +156,22 @@ def _act_request(call: ActCall) -> agent_pb2.ActRequest:
         request.deadline_ms = call.deadline_ms
     request.observation.state.extend(call.state.tolist())
     request.observation.nothing_executed = call.nothing_executed
-    for step in call.executed:
-        out = request.observation.executed.add()
-        if step.state is not None:
-            out.state.values.extend(step.state.tolist())
-        if step.action is not None:
-            out.action.values.extend(step.action.tolist())
-        if step.reward is not None:
-            out.reward = step.reward
+    request.observation.executed.extend(map(_executed, call.executed))
     if call.context is not None:
         rows, columns = call.context.shape
         request.observation.context.CopyFrom(agent_pb2.Matrix(values=call.context.ravel().tolist(), rows=rows, columns=columns))
     return request
+
+
+def _executed(step: ExecutedValues) -> agent_pb2.Executed:
+    out = agent_pb2.Executed()
+    if step.state is not None:
+        out.state.values.extend(step.state.tolist())
+    if step.action is not None:
+        out.action.values.extend(step.action.tolist())
+    if step.reward is not None:
+        out.reward = step.reward
+    return out
 
 
 _SPELL: dict[Kind, Callable[[Any], Any]] = {

@@ -22,7 +22,7 @@ from urllib.parse import quote, urlencode
 
 from ada_diffuser.errors import AdaError, DeadlineExceeded, Detail, Unavailable, UnexpectedAnswer, from_detail
 from ada_diffuser.faces import http_json
-from ada_diffuser.messages import ActCall, Chunk, Model, SamplerOptions, SessionSummary
+from ada_diffuser.messages import ActCall, Chunk, Model, OpenCall, SessionSummary
 
 #: A longer body is announced before it is sent: a server that finds it too large says so, and need not be sent all of it.
 _ANNOUNCED_LEN = 256 * 1024
@@ -40,12 +40,8 @@ class HttpFace:
         self._closed = False
         self._lock = threading.Lock()
 
-    def open_session(
-        self, model: str, seed: int | None, options: SamplerOptions, ttl_ms: int | None, request_id: str, timeout_s: float
-    ) -> tuple[SessionSummary, Model]:
-        options_out = http_json.options_out(options) or None
-        body = http_json.without_none(model=model or None, seed=seed, options=options_out, ttl_ms=ttl_ms, request_id=request_id)
-        answer = self._call("POST", "/v1/sessions", body, timeout_s)
+    def open_session(self, call: OpenCall, timeout_s: float) -> tuple[SessionSummary, Model]:
+        answer = self._call("POST", "/v1/sessions", http_json.open_body(call), timeout_s)
         return http_json.read(http_json.summary, answer, "session"), http_json.read(http_json.model, answer, "model")
 
     def act(self, call: ActCall, timeout_s: float) -> Chunk:

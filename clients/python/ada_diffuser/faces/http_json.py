@@ -12,8 +12,10 @@ from ada_diffuser.errors import AdaError, Detail, UnexpectedAnswer, from_detail
 from ada_diffuser.messages import (
     ActCall,
     Chunk,
+    ExecutedValues,
     Missing,
     Model,
+    OpenCall,
     Returns,
     SamplerOptions,
     SessionSummary,
@@ -33,22 +35,37 @@ def without_none(**pairs: Any) -> dict[str, Any]:
     return {name: value for name, value in pairs.items() if value is not None}
 
 
-def act_body(call: ActCall) -> dict[str, Any]:
-    """An act, but for its session."""
-    executed = [
+def open_body(call: OpenCall) -> dict[str, Any]:
+    """An open."""
+    return without_none(
+        model=call.model or None,
+        seed=call.seed,
+        options=options_out(call.options) or None,
+        ttl_ms=call.ttl_ms,
+        request_id=call.request_id,
+        history=_steps(call.history) or None,
+    )
+
+
+def _steps(steps: Sequence[ExecutedValues]) -> list[dict[str, Any]]:
+    return [
         without_none(
             state=None if step.state is None else step.state.tolist(),
             action=None if step.action is None else step.action.tolist(),
             reward=step.reward,
         )
-        for step in call.executed
+        for step in steps
     ]
+
+
+def act_body(call: ActCall) -> dict[str, Any]:
+    """An act, but for its session."""
     return without_none(
         step=call.step,
         episode=call.episode,
         observation=without_none(
             state=call.state.tolist(),
-            executed=executed,
+            executed=_steps(call.executed),
             nothing_executed=call.nothing_executed or None,
             context=None if call.context is None else call.context.tolist(),
         ),

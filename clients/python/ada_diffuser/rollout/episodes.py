@@ -48,7 +48,7 @@ def evaluate(client: Client, trial: Trial, progress: Progress = lambda steps: No
 
 
 class _Lane:
-    """One environment and its session on the server; an episode whose goal is told has a session of its own."""
+    """One environment and its session on the server; an episode whose goal is told, or that begins warm, has a session of its own."""
 
     def __init__(self, client: Client, trial: Trial, env: gymnasium.Env[Any, Any], seed: int) -> None:
         self.env, self._client, self._trial = env, client, trial
@@ -66,7 +66,7 @@ class _Lane:
 
     def _open(self, seed: int) -> Session:
         options = with_goal(self._trial.options, self.env, self._goal_columns)
-        return self._client.open_session(self._trial.model, seed=seed, options=options)
+        return self._client.open_session(self._trial.model, seed=seed, options=options, history=self._trial.history)
 
     def __enter__(self) -> _Lane:
         return self
@@ -94,11 +94,12 @@ class _Lane:
         """The next episode of the session with this seed: the environment goes on drawing where it was, and the model looks back."""
         index = len(self.episodes)
         observation, self._facts = self.env.reset(seed=None if index else seed)
-        if self._goal_columns:
+        goes_on = index > 0 and not self._trial.forget
+        if self._goal_columns or (self._trial.warm_start and not goes_on):
             self.broker.session.close()
             self.broker = ChunkBroker(self._open(_model_seed(seed, index)))
         else:
-            self.broker.reset(_model_seed(seed, index), keep_history=index > 0 and not self._trial.forget)
+            self.broker.reset(_model_seed(seed, index), keep_history=goes_on)
         self.state = np.asarray(observation, np.float32)
         self.episodes.append(Episode(seed, index=index, goal=environments.goal(self.env)))
 

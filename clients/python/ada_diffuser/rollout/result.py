@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ada_diffuser.messages import Chunk, Model, SamplerOptions, Timings
+from ada_diffuser.messages import Chunk, Executed, Model, SamplerOptions, Timings
+from ada_diffuser.rollout.warm_start import WarmStart
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class Trial:
     env_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     #: Whether each act tells the states that it plans.
     planned_states: bool = False
+    #: What each session is opened with; where the model forgets, each episode.
+    warm_start: WarmStart | None = None
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.vector < 1 or self.session_episodes < 1 or self.seed < 0:
@@ -48,6 +51,12 @@ class Trial:
     def env_options_as_json(self) -> dict[str, Any]:
         """Nothing where there are none."""
         return {"env_options": dict(self.env_options)} if self.env_options else {}
+
+    @property
+    def history(self) -> tuple[Executed, ...]:
+        """The warm start as a session is told it."""
+        steps = self.warm_start.steps if self.warm_start else ()
+        return tuple(replace(step, reward=None) for step in steps) if self.withhold_rewards else steps
 
     @property
     def sessions(self) -> list[tuple[int, int]]:
@@ -272,6 +281,7 @@ class Evaluation:
             "seed": self.trial.seed,
             "vector": self.trial.vector,
             "withhold_rewards": self.trial.withhold_rewards,
+            **({"warm_start": self.trial.warm_start.as_json()} if self.trial.warm_start else {}),
             "options": plain_options(self.options.given()),
             "returns": [round(value, 6) for value in self.returns.tolist()],
             "failed_seeds": [episode.seed for episode in self.episodes if episode.failed],

@@ -53,18 +53,20 @@ SESSION_VIEW_BASIC: SessionView
 SESSION_VIEW_FULL: SessionView
 
 class OpenSessionRequest(_message.Message):
-    __slots__ = ("model", "seed", "options", "ttl_ms", "request_id")
+    __slots__ = ("model", "seed", "options", "ttl_ms", "request_id", "history")
     MODEL_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     TTL_MS_FIELD_NUMBER: _ClassVar[int]
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
+    HISTORY_FIELD_NUMBER: _ClassVar[int]
     model: str
     seed: int
     options: _models_pb2.SamplerOptions
     ttl_ms: int
     request_id: str
-    def __init__(self, model: _Optional[str] = ..., seed: _Optional[int] = ..., options: _Optional[_Union[_models_pb2.SamplerOptions, _Mapping]] = ..., ttl_ms: _Optional[int] = ..., request_id: _Optional[str] = ...) -> None: ...
+    history: _containers.RepeatedCompositeFieldContainer[Executed]
+    def __init__(self, model: _Optional[str] = ..., seed: _Optional[int] = ..., options: _Optional[_Union[_models_pb2.SamplerOptions, _Mapping]] = ..., ttl_ms: _Optional[int] = ..., request_id: _Optional[str] = ..., history: _Optional[_Iterable[_Union[Executed, _Mapping]]] = ...) -> None: ...
 
 class OpenSessionResponse(_message.Message):
     __slots__ = ("session", "model")

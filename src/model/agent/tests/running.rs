@@ -105,7 +105,7 @@ fn a_history_is_kept_only_where_training_kept_one() {
     let networks = Networks::new(config.layout, &config.method, &Params::fresh(3)).unwrap();
     let untrained = Agent::new(config, networks, "alone".into());
     let (episode, _) = untrained.act(&untrained.open(1, &options()).unwrap(), &told(0..4)).unwrap();
-    assert!(matches!(untrained.reset(&episode, 1, true), Err(AgentError::HistoryNotKept)));
+    assert!(matches!(untrained.reset(&episode, 1, true), Err(AgentError::HistoryNotKept { field: "keep_history" })));
     assert!(untrained.reset(&episode, 1, false).is_ok() && trained.reset(&episode, 1, true).is_ok());
 }
 
