@@ -496,8 +496,8 @@ class Elbo(Latent):
 
 
 class Skills(nn.Module):
-    """The autoencoder of skills of Venkatraman et al. 2024: a bidirectional GRU over steps, a prior that sees the first state, and a decoder of
-    each action, column after column or all of them at once."""
+    """The autoencoder of skills of Venkatraman et al. 2024: a bidirectional GRU over steps, a prior that sees the first state, and a
+    decoder of each action, column after column or all of them at once."""
 
     BETA = 0.3
 

@@ -367,3 +367,43 @@ fn transitions_follow_one_another() {
     }
     assert_eq!(seen, (100..108).chain(200..212).collect());
 }
+
+/// What came of skills of three steps: what was done, what it paid, where it led to, and what an act there is given; where something ended the
+/// episode with it, the last step's.
+#[test]
+fn skills_lead_somewhere() {
+    let whole = episodes();
+    let mut ending = whole[1].clone();
+    ending.ended = true;
+    let episodes = vec![whole[0].clone(), ending];
+    let places = skill_places(&episodes, 3);
+    assert_eq!(places, (0..6).map(|t| (0, t)).chain((0..10).map(|t| (1, t))).collect::<Vec<_>>());
+    let shape = WindowShape {
+        batch: 1,
+        looks: Looks::Block(0),
+        plan: Diffusion { horizon: 1, diffused: Diffused::Code { dim: 4, steps: 3 }, ..plan(2) },
+        table: Table::new(Schedule::Uniform { steps: 5 }, [0, 1], 1, 8).unwrap(),
+        levels: Levels::Schedule,
+        action_horizons: vec![1],
+        ready_fraction: 0.0,
+        hide: Hide::NOTHING,
+        beside: Beside::default(),
+    };
+    let batch = skills(&episodes, &places, [3, 4], &mut Philox::new(2)).unwrap();
+    let given = given_after(&episodes, &places, &shape, &mut Philox::new(3)).unwrap();
+    let (steps, next, observed) = (rows(&batch.segments.steps), rows(&batch.next_state), rows(&given.observed.unwrap()));
+    assert_eq!(batch.segments.eps.dims(), [16, 1, 4]);
+    for (row, (episode, start)) in places.into_iter().enumerate() {
+        let state = |t: usize| (100 * (episode + 1) + t) as f32;
+        let done: Vec<_> = (start..start + 3).map(|t| vec![state(t), -state(t), t as f32 / 10.0]).collect();
+        assert_eq!(steps[row], done);
+        assert_eq!(batch.rewards[3 * row..3 * row + 3], [0, 1, 2].map(|i| -((start + i) as f32)));
+        let ends = (episode, start) == (1, 9);
+        assert_eq!(batch.ended[row], ends);
+        let led_to = if ends { 11 } else { start + 3 };
+        assert_eq!(next[row][0], [state(led_to), -state(led_to)]);
+        // The step before it, one of as many as a window has positions ago; then the state of now, without an action.
+        let before = [state(led_to - 1), -state(led_to - 1), (led_to - 1) as f32 / 10.0, 1.0];
+        assert_eq!(observed[row][0], [before, [state(led_to), -state(led_to), 0.0, 0.0]].concat());
+    }
+}

@@ -172,10 +172,7 @@ impl<'a> DoubleQLoss<'a> {
         let column = |values: Vec<f32>| Tensor::from_vec(values, (rows, 1, 1), &Device::Cpu);
         let (worth, discount) = (Worth::of(self.task), f64::from(self.task.config.method.discount));
         let steps = batch.rewards.len() / rows.max(1);
-        let own = |rewards: &[f32]| -> f32 {
-            let share = |(i, reward): (usize, &f32)| (1.0 - discount) * discount.powi(i as i32) * worth.of_reward(*reward);
-            rewards.iter().enumerate().map(share).sum::<f64>() as f32
-        };
+        let own = |rewards: &[f32]| own_share(rewards.iter().map(|reward| worth.of_reward(*reward)), discount) as f32;
         let of = SkillTransitions {
             state: &batch.segments.steps.narrow(1, 0, 1)?.narrow(2, 0, self.task.config.layout.state_dim)?.contiguous()?,
             code: &skill.codes(&batch.segments)?,
@@ -191,6 +188,11 @@ impl<'a> DoubleQLoss<'a> {
 }
 
 const NO_CRITIC: &str = "a model without critics has no error of them: is a bug";
+
+/// The share of a skill's own steps in what it is worth, `(1 - g) sum g^i w_i`: of what comes after them it is `g^H`, and of both together 1.
+fn own_share(worths: impl Iterator<Item = f64>, discount: f64) -> f64 {
+    worths.enumerate().map(|(i, worth)| (1.0 - discount) * discount.powi(i as i32) * worth).sum()
+}
 
 /// Places drawn by their priorities, and how much each counts: the less, the more often it is drawn; the least drawn of them wholly.
 fn replayed(priorities: &[f32], config: &DoubleQConfig, rng: &mut Philox) -> (Vec<usize>, Vec<f32>) {
@@ -211,6 +213,13 @@ fn replayed(priorities: &[f32], config: &DoubleQConfig, rng: &mut Philox) -> (Ve
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Half of the first, a quarter of the second, an eighth of the third; who earns 1 for ever is worth 1.
+    #[test]
+    fn a_skill_is_worth_its_share() {
+        assert_eq!(own_share([1.0, 2.0, 4.0].into_iter(), 0.5), 1.5);
+        assert!((own_share([1.0; 7].into_iter(), 0.9) + 0.9_f64.powi(7) - 1.0).abs() < 1e-12);
+    }
 
     /// Drawn as often as the power of the priority says, and what that does to the mean is taken back.
     #[test]
