@@ -5,7 +5,7 @@ use super::{
     AgentError, Ask, Chunk, Episode, Start,
     candidate::Candidate,
     chain::Chain,
-    episode::{Planned, Skill},
+    episode::Planned,
     restart::{Stored, choose_start},
     types::Known,
 };
@@ -74,7 +74,7 @@ impl Act {
         };
         let Known { told, truth, aligned, .. } = &known;
         // Of a skill under way there is nothing to choose.
-        let held = episode.skill().is_some();
+        let held = episode.code().is_some();
         let candidates = if held { 1 } else { options.candidates };
         Self {
             aligned: *aligned,
@@ -132,7 +132,7 @@ impl Act {
 
     /// Forwards that it still asks for; of one that has not started those of a warm start, if there may be one.
     pub fn evaluations_left(&self) -> usize {
-        if self.episode.skill().is_some() {
+        if self.episode.code().is_some() {
             return 0;
         }
         let left = |window: &Candidate| match self.stored().filter(|_| !self.started) {
@@ -208,9 +208,9 @@ impl Act {
     /// Chooses between the stored window and a cold start, and fills the windows.
     pub(super) fn start(&mut self, config: &ModelConfig, walk: Walk) {
         self.started = true;
-        if let Some(skill) = self.episode.skill() {
+        if let Some(code) = self.episode.code() {
             self.start = Start::Warm;
-            self.candidates.iter_mut().for_each(|window| window.hold(&skill.code));
+            self.candidates.iter_mut().for_each(|window| window.hold(code));
             return;
         }
         let (belief, rung) = (self.first().latents().get(0), self.first().descent().rung());
@@ -375,18 +375,18 @@ impl Act {
             start,
             degraded: descent.is_degraded(),
         };
-        let skill = Self::skill_after(&episode, &chosen, config);
+        let begun = Self::skill_begun(&episode, &chosen, config);
         let planned = Planned::new(descent.known().to_vec(), actions);
         let stored = Stored::new(chosen.into_window(), anchor);
         let after = episode.after(planned, stored, latent);
-        Ok((if let Some(skill) = skill { after.with_skill(skill) } else { after }, chunk))
+        Ok((if let Some((code, steps)) = begun { after.with_skill(code, steps) } else { after }, chunk))
     }
 
-    /// The skill that this act began, of a model that has skills. One that a deadline cut short is done once, and no longer.
-    fn skill_after(episode: &Episode, chosen: &Candidate, config: &ModelConfig) -> Option<Skill> {
+    /// The code of the skill that this act began, and for how many steps, of a model that has skills. One that a deadline cut short is done
+    /// once, and no longer.
+    fn skill_begun(episode: &Episode, chosen: &Candidate, config: &ModelConfig) -> Option<(Vec<f32>, u64)> {
         let (steps, descent) = (config.method.plan.diffused.code_steps()?, chosen.descent());
         let lasts = if descent.is_degraded() { 1 } else { steps as u64 };
-        let begun = || Skill { code: descent.given(0).to_vec(), end: episode.time() + lasts };
-        episode.skill().is_none().then(begun)
+        episode.code().is_none().then(|| (descent.given(0).to_vec(), lasts))
     }
 }

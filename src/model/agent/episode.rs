@@ -36,11 +36,11 @@ pub struct Episode {
 
 /// A skill under way.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Skill {
+struct Skill {
     /// What stands for it.
-    pub(super) code: Vec<f32>,
+    code: Vec<f32>,
     /// When it is over: the environment time of the next one's first decision.
-    pub(super) end: u64,
+    end: u64,
 }
 
 /// What the last act saw and answered, normalized units.
@@ -160,9 +160,9 @@ impl Episode {
         self.window.take()
     }
 
-    /// The skill under way, if there is one.
-    pub(super) fn skill(&self) -> Option<&Skill> {
-        self.skill.as_ref().filter(|skill| self.time < skill.end)
+    /// The code of the skill under way, if there is one.
+    pub(super) fn code(&self) -> Option<&[f32]> {
+        self.skill.as_ref().filter(|skill| self.time < skill.end).map(|skill| skill.code.as_slice())
     }
 
     /// The episode after an act; the window is kept for the next one where acts stream.
@@ -172,9 +172,9 @@ impl Episode {
         Self { planned: Some(planned), window, latent, ..self }
     }
 
-    /// The same with another skill under way.
-    pub(super) fn with_skill(self, skill: Skill) -> Self {
-        Self { skill: Some(skill), ..self }
+    /// The same with another skill under way, for so many steps from now on.
+    pub(super) fn with_skill(self, code: Vec<f32>, steps: u64) -> Self {
+        Self { skill: Some(Skill { code, end: self.time + steps }), ..self }
     }
 
     /// Noise seed of the episode.
