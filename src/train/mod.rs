@@ -49,7 +49,7 @@ use dataset::{
 use learner::Learner;
 use log::{Clock, Log};
 use position::Position;
-use recipe::Recipe;
+use recipe::{Recipe, losses::Loss};
 use resume::Store;
 use std::{
     fs::{self, File},
@@ -218,6 +218,11 @@ fn units_of_context(episodes: &[Episode], columns: usize) -> Result<Affine> {
 /// # Errors
 /// If the data set or the recipe is wrong, the gate is never passed, the loss diverges, or the disk refuses.
 pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
+    let moves_planner = recipe.stages.last().is_some_and(|stage| stage.weight(Loss::Denoise) > 0.0);
+    ensure!(
+        moves_planner || !options.keep_best,
+        "--keep-best goes by the held-out denoising error, which the last stage of this recipe does not move: leave it out"
+    );
     let dir = options.out.join(TRAINING_DIR);
     let task = Task::new(recipe, &Room::new(options.data_memory_mib, dir.clone()))?;
     let _alone = lock(&dir)?;

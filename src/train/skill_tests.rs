@@ -1,7 +1,7 @@
 //! Runs of skills: an autoencoder, a prior of its codes, and critics of them, one stage after the other.
 
 use super::{
-    Outcome, Task,
+    Options, Outcome, Task,
     dataset::room::Room,
     losses::Objective,
     recipe::RecipeError,
@@ -76,6 +76,14 @@ fn a_stopped_run_of_skills_goes_on_with_the_same_bits() {
     // An average of what stands still is that but for rounding.
     let moved: Vec<&String> = long.keys().filter(|name| far(name) > 1e-5).collect();
     assert!(moved.len() >= 10 && moved.iter().all(|name| name.starts_with("critic.")), "{moved:?}");
+}
+
+/// The best would be the first: what it goes by stands still in the last stage.
+#[test]
+fn the_best_is_not_kept_by_what_stands_still() {
+    let dir = tempfile::tempdir().unwrap();
+    let refused = train_as(&SKILLS, Options { keep_best: true, ..options(dir.path(), None) }).unwrap_err().to_string();
+    assert!(refused.contains("--keep-best") && fs::read_dir(dir.path()).unwrap().next().is_none(), "{refused}");
 }
 
 /// Errors on held-out episodes fall when they are what is minimized.
