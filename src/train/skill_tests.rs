@@ -78,6 +78,18 @@ fn a_stopped_run_of_skills_goes_on_with_the_same_bits() {
     assert!(moved.len() >= 10 && moved.iter().all(|name| name.starts_with("critic.")), "{moved:?}");
 }
 
+/// The weights of a stage do not depend on how they are averaged, but what it hands on does.
+#[test]
+fn a_stage_hands_on_its_average() {
+    let skills = |decay: &str| {
+        let dir = tempfile::tempdir().unwrap();
+        train(&with(&[decay]), dir.path(), None).unwrap();
+        let tensors = candle_core::safetensors::load(dir.path().join("model.safetensors"), &candle_core::Device::Cpu).unwrap();
+        tensors["skill.posterior.weight"].flatten_all().unwrap().to_vec1::<f32>().unwrap()
+    };
+    assert_ne!(skills("stages.skills.ema_decay_max=0.9"), skills("stages.skills.ema_decay_max=0.0"));
+}
+
 /// The best would be the first: what it goes by stands still in the last stage.
 #[test]
 fn the_best_is_not_kept_by_what_stands_still() {
