@@ -63,6 +63,7 @@
 //! | which episodes a loss draws from; a batch cut from them, over the border of a session too | [`train::dataset::Which`], [`train::dataset::window`] |
 //! | what was executed, as tokens; a history that outlasts an episode, or is brought along | `model/agent/executed.rs`, [`model::agent::Agent::recall`] |
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
+//! | a session as bytes; an episode that was written down, taken up again | [`serve::session::Record`], [`model::agent::Agent::adopt`] |
 //! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |
 //!
 //! # Paper and code

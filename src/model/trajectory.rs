@@ -25,7 +25,8 @@ impl Layout {
 }
 
 /// What is known of one time step, in normalized units; an unknown part is `None` and reaches the network as a learned vector.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Token {
     /// s_t, `state_dim` values.
     pub state: Option<Vec<f32>>,

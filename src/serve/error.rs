@@ -63,6 +63,16 @@ pub enum ServiceError {
         /// What there is.
         instead: String,
     },
+    /// Serve that checkpoint again, or open a session on another.
+    #[error(
+        "the session began on the model {model}, which is not served here: serve that checkpoint again, or open a new session; {instead}"
+    )]
+    ModelGone {
+        /// Name and digest.
+        model: String,
+        /// What there is.
+        instead: String,
+    },
     /// Send less.
     #[error("{what} exceeds {limit}")]
     TooLarge {
@@ -168,6 +178,7 @@ impl ServiceError {
             AgentError::InvalidObservation { field, reason } => Self::invalid(format!("observation.{field}"), reason),
             AgentError::InvalidOptions { field, reason } => Self::invalid(format!("options.{field}"), reason),
             AgentError::InvalidHistory { field, reason } => Self::invalid(field, reason),
+            AgentError::InvalidEpisode { field, reason } => Self::invalid(format!("episode.{field}"), reason),
             ref error @ AgentError::HistoryNotKept { field } => Self::invalid(field, error.to_string()),
             AgentError::NonFinite => {
                 let id = Uuid::new_v4();
@@ -191,6 +202,7 @@ impl ServiceError {
             Self::SessionExpired => "SESSION_EXPIRED",
             Self::SessionEvicted => "SESSION_EVICTED",
             Self::ModelNotFound { .. } => "MODEL_NOT_FOUND",
+            Self::ModelGone { .. } => "MODEL_GONE",
             Self::TooLarge { .. } => "TOO_LARGE",
             Self::QueueFull { .. } => "QUEUE_FULL",
             Self::Quota { .. } => "QUOTA",
@@ -275,6 +287,7 @@ impl ServiceError {
             (Self::SessionExpired, 5, 410, "SESSION_EXPIRED"),
             (Self::SessionEvicted, 5, 410, "SESSION_EVICTED"),
             (Self::ModelNotFound { model: "x".into(), instead: "there are: y".into() }, 5, 404, "MODEL_NOT_FOUND"),
+            (Self::ModelGone { model: "x@0".into(), instead: "there are: y".into() }, 5, 410, "MODEL_GONE"),
             (Self::TooLarge { what: "bytes", limit: 1 }, 8, 413, "TOO_LARGE"),
             (Self::QueueFull { retry_after_ms }, 8, 429, "QUEUE_FULL"),
             (Self::Quota { retry_after_ms }, 8, 429, "QUOTA"),

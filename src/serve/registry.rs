@@ -114,6 +114,19 @@ impl Registry {
             .then_some(model)
             .ok_or_else(|| not_found(format!("the digest of {name} is {actual} (name {DIGEST_PREFIX_MIN} digits of it at least)")))
     }
+
+    /// The model that a session began on: the same weights, under whichever name they are served here.
+    ///
+    /// # Errors
+    /// `ModelGone`.
+    pub fn pinned(&self, name: &str, digest: &str) -> Result<&Model, ServiceError> {
+        let same = |model: &&Model| model.agent.spec().digest == digest;
+        let gone = || ServiceError::ModelGone {
+            model: format!("{name}@{digest}").chars().take(2 * checkpoint::NAME_LEN_MAX).collect(),
+            instead: format!("there are: {}", names(&self.models)),
+        };
+        self.models.get(name).filter(same).or_else(|| self.models.values().find(same)).ok_or_else(gone)
+    }
 }
 
 /// Names of the models, for errors.

@@ -66,6 +66,34 @@ pub struct Opened {
     pub untold: Option<Arc<Untold>>,
 }
 
+/// ImportSession.
+#[derive(Clone, Debug, Default)]
+pub struct ImportRequest {
+    /// What ExportSession gave, here or elsewhere.
+    pub record: Vec<u8>,
+    /// Idle time to live; None: that of the session which was exported.
+    pub ttl_ms: Option<u64>,
+    /// The client's name for this request; empty: none.
+    pub request_id: String,
+}
+
+/// ForkSession.
+#[derive(Clone, Debug, Default)]
+pub struct ForkRequest {
+    /// Id of the session that it goes on from, as the client wrote it.
+    pub session_id: String,
+    /// Noise seed from now on; None: that of the session, so that both have the same future.
+    pub seed: Option<u64>,
+    /// Idle time to live; None: that of the session.
+    pub ttl_ms: Option<u64>,
+    /// The client's name for this request; empty: none.
+    pub request_id: String,
+    /// Committed step that it goes on from; None: whichever it is.
+    pub step: Option<u64>,
+    /// The episode of that step; None: the running one.
+    pub episode: Option<u64>,
+}
+
 /// ResetSession.
 #[derive(Clone, Debug, Default)]
 pub struct ResetRequest {

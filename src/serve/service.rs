@@ -9,9 +9,9 @@ use crate::{
         error::{ServiceError, Stage},
         idle::{Idle, until_idle},
         registry::{Model, Registry, RegistryError},
-        request::{ActRequest, ActResult, Acted, ListRequest, OpenRequest, Opened, Page, ResetRequest},
+        request::{ActRequest, ActResult, Acted, ForkRequest, ImportRequest, ListRequest, OpenRequest, Opened, Page, ResetRequest},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
-        session::{Answer, Entry, Handle, Opening, Session, Sessions, Summary, Untold, Waiter, key_of},
+        session::{Answer, Entry, Handle, Opening, Record, Session, Sessions, Standing, Summary, Untold, Waiter, key_of},
         telemetry,
     },
 };
@@ -168,8 +168,61 @@ impl Service {
         let ttl = self.ttl(ttl_ms)?;
         let options = options.onto(&model.agent.spec().sampler);
         let episode = model.agent.recall(seed.unwrap_or_else(draw_seed), &options, &history).map_err(ServiceError::from_agent)?;
+        self.begin(model, (episode, Standing::default()), ttl, request_id)
+    }
+
+    /// ExportSession: what is committed at this moment, as bytes for [`Service::import`] here or elsewhere.
+    ///
+    /// # Errors
+    /// `SessionNotFound` and its kin, `NotReady`; while draining it goes on, as this is when a session may have to leave.
+    pub fn export(&self, session_id: &str) -> Result<Vec<u8>, ServiceError> {
+        let session = self.sessions.get(parse_id(session_id)?, Instant::now())?;
+        Record::of(&session)?.write().map_err(|error| ServiceError::internal(&error))
+    }
+
+    /// ImportSession: another session, which goes on from where the exported one stood, with the same answers.
+    ///
+    /// # Errors
+    /// `Invalid` naming what is wrong with the record, `ModelGone`, and those of [`Service::open`].
+    pub fn import(&self, request: ImportRequest) -> Result<Opened, ServiceError> {
+        let ImportRequest { record, ttl_ms, request_id } = request;
+        let registry = self.registry()?;
+        check_request_id(&request_id)?;
+        let record = Record::read(&record).map_err(|error| ServiceError::invalid("record", error.to_string()))?;
+        let model = registry.pinned(&record.model, &record.model_digest)?.clone();
+        let ttl = self.ttl(ttl_ms.or(Some(record.ttl_ms.clamp(1, self.config.sessions.ttl_ms_max))))?;
+        let wrong = |(field, reason): (String, String)| ServiceError::invalid(format!("record.{field}"), reason);
+        let (episode, standing) = record.standing(&model.agent).map_err(wrong)?;
+        self.check_steps_told(episode.unread_len(), "number of steps that are yet to be read")?;
+        self.begin(model, (episode, standing), ttl, request_id)
+    }
+
+    /// ForkSession: another session that goes on from where this one stands.
+    ///
+    /// # Errors
+    /// `SessionNotFound` and its kin, `EpisodeOver` and `StepOutOfOrder` where it stands elsewhere, and those of [`Service::open`].
+    pub fn fork(&self, request: ForkRequest) -> Result<Opened, ServiceError> {
+        let ForkRequest { session_id, seed, ttl_ms, request_id, step, episode } = request;
+        let registry = self.registry()?;
+        check_request_id(&request_id)?;
+        let session = self.session(&session_id)?;
+        let ttl = ttl_ms.map_or(Ok(session.ttl()), |ttl_ms| self.ttl(Some(ttl_ms)))?;
+        let (parent, standing) = session.standing((episode, step))?;
+        let model = registry.pinned(&session.model, &session.agent.spec().digest)?.clone();
+        let (own, forked) = (parent.seed(), (*parent).clone());
+        self.begin(model, (forked.with_seed(seed.unwrap_or(own)), standing), ttl, request_id)
+    }
+
+    /// A session that goes on from here.
+    fn begin(
+        &self,
+        model: Model,
+        (episode, standing): (Episode, Standing),
+        ttl: Duration,
+        request_id: String,
+    ) -> Result<Opened, ServiceError> {
         let is_named = !request_id.is_empty();
-        let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, options, ttl, request_id };
+        let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, standing, ttl, request_id };
         let now = Instant::now();
         let session = self.sessions.open(opening, now)?;
         let untold = (!is_named).then(|| Untold::new(self.sessions.clone(), session.clone()));

@@ -29,7 +29,7 @@ from ada_diffuser import (
     Unavailable,
     retry,
 )
-from ada_diffuser.errors import Detail, SessionGone, UnexpectedAnswer, from_detail
+from ada_diffuser.errors import Detail, ModelGone, SessionGone, UnexpectedAnswer, from_detail
 from ada_diffuser.faces import connect
 
 FAST = RetryPolicy(attempts=4, base_s=0.01, cap_s=0.02, budget_s=5.0)
@@ -332,6 +332,8 @@ def test_errors_without_a_reason_go_by_code_or_status() -> None:
     assert type(from_detail(Detail("?"), http_status=418)) is UnexpectedAnswer
     gone = from_detail(Detail("old", "SESSION_EXPIRED"), http_status=410)
     assert type(gone) is SessionGone and isinstance(gone, NotFound)
+    model = from_detail(Detail("old", "MODEL_GONE"), http_status=410)
+    assert type(model) is ModelGone and isinstance(model, NotFound), "by its reason, not by its status"
     assert pickle.loads(pickle.dumps(gone)).reason == "SESSION_EXPIRED"
 
 

@@ -318,6 +318,52 @@ def test_rollouts_are_the_same_by_both_faces_alone_and_in_a_batch(address: str) 
     assert returns["grpc alone"] == returns["http alone"] == returns["batch"]
 
 
+def test_a_session_goes_on_elsewhere_and_twice(address: str) -> None:
+    """What was exported by one face is imported by the other, answers the same, and is no longer bound to the first."""
+    noisy = SamplerOptions(temperature=1.0, eta=0.5, latent="sample")
+    for face, other in (FACES, FACES[::-1]):
+        with Client(f"{face}://{address}") as here, Client(f"{other}://{address}") as there:
+            with here.open_session("tiny", seed=8, options=noisy, ttl_ms=70_000) as session:
+                last = drive(session, 3)[-1]
+                record = session.export()
+                twin, fork = session.fork(), session.fork(seed=9, ttl_ms=80_000)
+                expected = [substance(chunk)[:-1] for chunk in drive(session, 3)]
+            gone_on = there.import_session(record)
+            assert (gone_on.committed_step, gone_on.seed, gone_on.options.eta) == (3, 8, 0.5)
+            assert (gone_on.summary().ttl_ms, fork.summary().ttl_ms, fork.seed) == (70_000, 80_000, 9)
+            assert len({session.session_id, gone_on.session_id, twin.session_id, fork.session_id}) == 4
+            gone_on._committed_step = 2  # as if the answer of the last act had been lost
+            lost = gone_on.act(STATES[2], reward=-0.2)
+            assert lost.replayed and substance(lost)[:-1] == substance(last)[:-1]
+            for goes_on in (gone_on, twin):
+                assert [substance(chunk)[:-1] for chunk in drive(goes_on, 3)] == expected
+            otherwise = [substance(chunk)[:-1] for chunk in drive(fork, 3)]
+            assert all(a != b for a, b in zip(otherwise, expected, strict=True))
+            moved = there.attach(gone_on.session_id)
+            moved._committed_step = 2
+            with pytest.raises(StepConflict) as caught:
+                moved.fork()
+            assert (caught.value.reason, caught.value.committed_step) == ("STEP_OUT_OF_ORDER", 6)
+            for rest in (gone_on, twin, fork):
+                rest.close()
+
+
+def test_what_cannot_be_imported_says_why(client: Client) -> None:
+    with client.open_session("tiny", seed=8) as session:
+        record = bytearray(session.export())
+        assert client.import_session(memoryview(record)).committed_step == 0
+    for wrong, reason in ((record[:-1], "damaged"), (b"", "no session"), (b"ADAS\xff" + record[5:], "format 255")):
+        with pytest.raises(InvalidInput, match=reason) as caught:
+            client.import_session(wrong)
+        assert (caught.value.reason, caught.value.field) == ("REQUEST_INVALID", "record")
+    with pytest.raises(InvalidInput, match="record: is no bytes, but a str"):
+        client.import_session("ADAS")  # type: ignore[arg-type]
+    with pytest.raises(NotFound):
+        session.export()
+    with pytest.raises(NotFound):
+        session.fork()
+
+
 def test_an_episode_that_is_over_takes_no_act(client: Client) -> None:
     """Whoever drove a session that somebody else had reset drove the new episode, and did not know."""
     with client.open_session("tiny", seed=3) as session:

@@ -80,6 +80,10 @@ def test_answers_fit_their_schemas(address: str, spec: dict[str, Any]) -> None:
     assert [sorted(result)[0] for result in batch["results"]] == ["response", "error"]
     assert ask("GET", session, path=f"/v1/sessions/{name}")["session"]["committed_step"] == 1
     assert ask("POST", f"{session}/reset", {}, path=f"/v1/sessions/{name}/reset")["session"]["episode"] == 1
+    record = ask("GET", f"{session}/export", path=f"/v1/sessions/{name}/export")
+    assert ask("POST", "/v1/sessions:import", record)["session"]["episode"] == 1
+    assert ask("POST", "/v1/sessions:import", {"record": ""})["field"] == "record"
+    assert ask("POST", f"{session}/fork", {"seed": 2}, path=f"/v1/sessions/{name}/fork")["session"]["seed"] == 2
     assert len(ask("GET", "/v1/sessions", path="/v1/sessions?page_size=1&model=tiny")["sessions"]) == 1
     assert ask("GET", "/v1/models")["models"]
     assert ask("GET", "/v1/models/{name}", path="/v1/models/tiny")["model"]["name"] == "tiny"

@@ -27,7 +27,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from ada_diffuser.errors import AdaError, InvalidInput, NotFound, TooLarge, Unavailable
 from ada_diffuser.faces import Face, connect
-from ada_diffuser.messages import ActCall, Chunk, Executed, Model, Observation, OpenCall, SamplerOptions, SessionSummary, executed_values
+from ada_diffuser.messages import (
+    ActCall,
+    Chunk,
+    Executed,
+    ForkCall,
+    Model,
+    Observation,
+    OpenCall,
+    SamplerOptions,
+    SessionSummary,
+    executed_values,
+)
 from ada_diffuser.retry import Backoff, RetryPolicy
 from ada_diffuser.values import column, flag, invalid, matrix, text, vector, whole
 
@@ -131,6 +142,18 @@ class Client:
         name, seed, ttl_ms = _model_name(model), _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
         call = OpenCall(name, seed, _options(options), ttl_ms, uuid4().hex, executed_values(history, "history"))
         summary, spec = self._tried(lambda timeout_s: self._face.open_session(call, timeout_s))
+        return Session(self, summary, spec)
+
+    def import_session(self, record: bytes, *, ttl_ms: int | None = None) -> Session:
+        """A session that goes on from where an exported one stood (`Session.export`), here or on another server.
+
+        Same observations, same chunks as there, that of its last act included; `catch_up` is not needed. The model has to be served, by
+        whatever name; `ModelGone` where it is not.
+        """
+        if not isinstance(record, (bytes, bytearray, memoryview)):
+            raise invalid("record", f"is no bytes, but a {type(record).__name__}")
+        record, ttl_ms, request_id = bytes(record), _whole_if_given(ttl_ms, "ttl_ms"), uuid4().hex
+        summary, spec = self._tried(lambda timeout_s: self._face.import_session(record, ttl_ms, request_id, timeout_s))
         return Session(self, summary, spec)
 
     def attach(self, session_id: str) -> Session:
@@ -238,6 +261,13 @@ class Client:
             lambda timeout_s: self._face.reset_session(session_id, seed, keep_history, request_id, episode, timeout_s),
             lambda error: error.retryable or error.reason == "SESSION_BUSY",
         )
+
+    def _export(self, session_id: str) -> bytes:
+        return self._tried(lambda timeout_s: self._face.export_session(session_id, timeout_s))
+
+    def _fork(self, call: ForkCall) -> Session:
+        summary, spec = self._tried(lambda timeout_s: self._face.fork_session(call, timeout_s))
+        return Session(self, summary, spec)
 
     def _close_session(self, session_id: str) -> None:
         # Not found: a close whose answer was lost, or the session expired. It is closed either way.
@@ -391,6 +421,22 @@ class Session:
         summary = self.summary()
         self.seed, self._committed_step, self._episode = summary.seed, summary.committed_step, summary.episode
         return self._committed_step
+
+    def export(self) -> bytes:
+        """The session as bytes, as it stands on the server: to go on with it elsewhere, or later (`Client.import_session`).
+
+        This one goes on too. The bytes tell what it has seen, so they are as private as that; they hold neither its id nor the model.
+        """
+        return self._client._export(self.session_id)
+
+    def fork(self, seed: int | None = None, *, ttl_ms: int | None = None) -> Session:
+        """Another session that goes on from here; this one goes on too.
+
+        Without `seed` both have the same future, as long as they see the same; with it the noise from now on is another one: plans to
+        compare, in a simulator that was copied. `StepConflict` where the server's session stands elsewhere.
+        """
+        seed, ttl_ms = _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
+        return self._client._fork(ForkCall(self.session_id, seed, ttl_ms, uuid4().hex, self._committed_step, self._episode))
 
     def close(self) -> None:
         """Ends the session on the server; a second close does nothing."""

@@ -87,6 +87,10 @@ class SessionGone(NotFound):
     """The session expired or made room for others: open a new one. SESSION_EXPIRED, SESSION_EVICTED."""
 
 
+class ModelGone(NotFound):
+    """The checkpoint that the session began on is not served there: serve it again, or open a new session. MODEL_GONE."""
+
+
 class StepConflict(AdaError):
     """Somebody else moved the session: go on by `session.catch_up()`. STEP_OUT_OF_ORDER, SESSION_BUSY, EPISODE_OVER."""
 
@@ -137,6 +141,7 @@ _BY_REASON: dict[str, type[AdaError]] = {
     "TOO_LARGE": TooLarge,
     "SESSION_NOT_FOUND": NotFound,
     "MODEL_NOT_FOUND": NotFound,
+    "MODEL_GONE": ModelGone,
     "SESSION_EXPIRED": SessionGone,
     "SESSION_EVICTED": SessionGone,
     "STEP_OUT_OF_ORDER": StepConflict,

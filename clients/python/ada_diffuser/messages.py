@@ -76,6 +76,18 @@ class ExecutedValues:
 
 
 @dataclass(frozen=True, eq=False)
+class ForkCall:
+    """One fork on the wire, the same value for every attempt: of the step where the client stands, so that it is refused anywhere else."""
+
+    session_id: str
+    seed: int | None
+    ttl_ms: int | None
+    request_id: str
+    step: int
+    episode: int
+
+
+@dataclass(frozen=True, eq=False)
 class OpenCall:
     """One open on the wire. A retry sends this very value again, so it gets the session that the first attempt opened."""
 

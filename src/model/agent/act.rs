@@ -345,7 +345,7 @@ impl Act {
     }
 
     pub(super) fn finish(self, config: &ModelConfig, walk: Walk) -> Result<(Episode, Chunk), AgentError> {
-        if self.has_failed() || self.choice.worth.is_some_and(|(value, _)| !value.is_finite()) {
+        if self.has_failed() {
             return Err(AgentError::NonFinite);
         }
         let (evaluations, passes) = (self.evaluations(), self.passes());
@@ -375,6 +375,9 @@ impl Act {
             start,
             degraded: descent.is_degraded(),
         };
+        if !chunk.is_finite() {
+            return Err(AgentError::NonFinite);
+        }
         let begun = Self::skill_begun(&episode, &chosen, config);
         let planned = Planned::new(descent.known().to_vec(), actions);
         let stored = Stored::new(chosen.into_window(), anchor);

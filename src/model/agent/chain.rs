@@ -1,11 +1,13 @@
 //! The latents of an act in progress, each known from the one before by the prior.
 
 use crate::model::latent::{GaussianRef, LOG_VAR};
+use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
 /// Distributions of the latents from the act's first position on, `T + action_horizon - 1` of them; without any for a model without
 /// latents.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct Chain {
     mean: Vec<f32>,
     log_var: Vec<f32>,
@@ -17,6 +19,12 @@ pub(super) struct Chain {
 impl Chain {
     pub(super) fn new(len: usize, dim: usize) -> Self {
         Self { mean: vec![0.0; len * dim], log_var: vec![0.0; len * dim], dim, first: 0 }
+    }
+
+    /// Whether it is one of so many latents of this width, none given out and all of them finite.
+    pub(super) fn is_whole(&self, len: usize, dim: usize) -> bool {
+        let values = |values: &[f32]| values.len() == len * dim && values.iter().all(|value| value.is_finite());
+        self.dim == dim && self.first == 0 && values(&self.mean) && values(&self.log_var)
     }
 
     pub(super) fn size_bytes(&self) -> usize {

@@ -2,17 +2,25 @@
 
 use super::restart::Stored;
 use crate::model::{
+    columns::Columns,
+    config::ModelConfig,
+    diffusion::descent::Window,
+    method::{GruLatent, Method},
     options::SamplerOptions,
-    trajectory::{Token, TokenRef},
+    trajectory::{Layout, Token, TokenRef},
 };
+use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
+/// Later than any episode comes, and exact in every reader's numbers.
+const TIME_MAX: u64 = 1 << 53;
 /// Tokens whose memory is not given back: the usual chunks are read without a change of it.
 const SPARE: usize = 16;
 
 /// One episode as a value: what it remembers of the past, and its partly denoised window. Cloned, never changed in place by an act that
 /// has not finished.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Episode {
     seed: u64,
     options: SamplerOptions,
@@ -35,7 +43,8 @@ pub struct Episode {
 }
 
 /// A skill under way.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Skill {
     /// What stands for it.
     code: Vec<f32>,
@@ -43,8 +52,33 @@ struct Skill {
     end: u64,
 }
 
+/// Sizes of all that an episode of a model holds.
+pub(super) struct Sizes<'a> {
+    layout: Layout,
+    /// Width of the latent.
+    latent: usize,
+    /// Width of a GRU that runs on; 0 where none does.
+    memory: usize,
+    /// Tokens that are kept beside those to be read.
+    kept: usize,
+    /// Positions of the window.
+    horizon: usize,
+    columns: &'a Columns,
+    /// The lowest row at which a window may wait; None where none does.
+    row_max: Option<usize>,
+}
+
+impl<'a> Sizes<'a> {
+    pub(super) fn new(config: &ModelConfig, columns: &'a Columns, kept: usize, row_max: Option<usize>) -> Self {
+        let Method { latent, plan, .. } = &config.method;
+        let memory = latent.gru().map_or(0, GruLatent::memory_len);
+        Self { layout: config.layout, latent: latent.dim(), memory, kept, horizon: plan.horizon, columns, row_max }
+    }
+}
+
 /// What the last act saw and answered, normalized units.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct Planned {
     state: Vec<f32>,
     actions: Vec<Vec<f32>>,
@@ -61,6 +95,10 @@ impl Planned {
 
     pub(super) fn actions(&self) -> &[Vec<f32>] {
         &self.actions
+    }
+
+    fn fits(&self, [state, action]: [usize; 2], horizon: usize) -> bool {
+        are(&self.state, state) && self.actions.len() <= horizon && self.actions.iter().all(|values| are(values, action))
     }
 }
 
@@ -177,6 +215,39 @@ impl Episode {
         Self { skill: Some(Skill { code, end: self.time + steps }), ..self }
     }
 
+    /// What of it is none of a model of these sizes, and why; None: it may be one of its episodes.
+    pub(super) fn misfit(&self, sizes: &Sizes) -> Option<(&'static str, String)> {
+        let [state, action] = [sizes.layout.state_dim, sizes.layout.action_dim];
+        let latents = self.latent.iter().flat_map(|(mean, log_var)| [mean, log_var]);
+        let code = self.skill.as_ref().map_or(0, |skill| skill.end);
+        let checks = [
+            ("time", self.time.max(code) > TIME_MAX),
+            (
+                "history",
+                self.history.len() > sizes.kept.max(self.unread) + 1 || !self.history.iter().all(|token| fits(token, sizes.layout)),
+            ),
+            ("memory", !are(&self.memory, sizes.memory)),
+            ("unread", self.unread > self.history.len() || self.unread > 0 && sizes.memory == 0),
+            ("planned", !self.planned.iter().all(|planned| planned.fits([state, action], sizes.horizon))),
+            ("window", !self.window.iter().all(|window| window_fits(window, sizes))),
+            ("latent", !latents.into_iter().all(|values| sizes.latent > 0 && are(values, sizes.latent))),
+            ("skill", !self.skill.iter().all(|skill| !skill.code.is_empty() && are(&skill.code, sizes.columns.code.len()))),
+        ];
+        let (field, _) = checks.into_iter().find(|(_, wrong)| *wrong)?;
+        Some((field, "is none of this model: another size, or a number that is not finite".into()))
+    }
+
+    /// Tokens that a GRU which runs on has yet to read.
+    pub fn unread_len(&self) -> usize {
+        self.unread
+    }
+
+    /// The same with the noise of another seed from now on.
+    #[must_use]
+    pub fn with_seed(self, seed: u64) -> Self {
+        Self { seed, ..self }
+    }
+
     /// Noise seed of the episode.
     pub fn seed(&self) -> u64 {
         self.seed
@@ -210,4 +281,24 @@ impl Episode {
         let skill = floats(self.skill.as_ref().map(|skill| &skill.code));
         size_of::<Self>() + history + memory + planned + window + latent + skill
     }
+}
+
+/// So many numbers, all finite.
+fn are(values: &[f32], count: usize) -> bool {
+    values.len() == count && values.iter().all(|value| value.is_finite())
+}
+
+fn fits(token: &Token, layout: Layout) -> bool {
+    let Token { state, action, reward, noise } = token;
+    let parts = [(state, layout.state_dim), (action, layout.action_dim)];
+    let numbers = reward.iter().chain([noise]).all(|value| value.is_finite());
+    numbers && parts.into_iter().all(|(part, count)| part.as_ref().is_none_or(|values| are(values, count)))
+}
+
+fn window_fits(stored: &Stored, sizes: &Sizes) -> bool {
+    let Window { x, row, predicted_state } = stored.window();
+    let columns = sizes.columns;
+    let is_low = sizes.row_max.is_some_and(|row_max| *row <= row_max);
+    let values = are(x, sizes.horizon * columns.width()) && are(predicted_state, columns.state.len());
+    is_low && values && stored.anchor_is_whole(sizes.latent)
 }

@@ -3,6 +3,7 @@
 //! `act` is a function `(Episode, Observation) -> (Episode, Chunk)`. An act in progress is an [`Act`], which asks; each [`Agent::advance`]
 //! answers all that is asked, with one denoiser forward shared by all acts given to it, whatever rungs they stand on.
 mod act;
+mod adopted;
 mod answers;
 mod ask;
 mod candidate;
@@ -95,9 +96,13 @@ impl Agent {
     /// # Errors
     /// [`AgentError::InvalidOptions`] if an option does not fit the model.
     pub fn open(&self, seed: u64, options: &SamplerOptions) -> Result<Episode, AgentError> {
-        self.config.check_options(options).map_err(|(field, reason)| AgentError::InvalidOptions { field, reason })?;
+        self.check_options(options)?;
         let memory = self.config.method.latent.gru().map_or(0, GruLatent::memory_len);
         Ok(Episode::new(seed, options.clone(), memory))
+    }
+
+    fn check_options(&self, options: &SamplerOptions) -> Result<(), AgentError> {
+        self.config.check_options(options).map_err(|(field, reason)| AgentError::InvalidOptions { field, reason })
     }
 
     /// A new episode with the options of an old one. With `keep_history` the latent goes on looking back on the old one's last steps,

@@ -7,9 +7,11 @@ use crate::model::{
     diffusion::descent::Window,
     latent::GaussianRef,
 };
+use serde::{Deserialize, Serialize};
 
 /// The window that an act leaves for the next one.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct Stored {
     window: Window,
     /// See [`Self::anchor`]: a chain of one, empty for a model without latents.
@@ -19,6 +21,11 @@ pub(super) struct Stored {
 impl Stored {
     pub(super) fn new(window: Window, anchor: Chain) -> Self {
         Self { window, anchor }
+    }
+
+    /// Its beliefs are part of it.
+    pub(super) fn anchor_is_whole(&self, dim: usize) -> bool {
+        self.anchor.is_whole(1, dim)
     }
 
     pub(super) fn window(&self) -> &Window {

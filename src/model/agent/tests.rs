@@ -12,6 +12,7 @@ use crate::model::{
     trajectory::Layout,
 };
 
+mod adopted;
 mod executed;
 mod guidance;
 mod methods;

@@ -7,6 +7,7 @@ use crate::model::{
     options::SamplerOptions,
     trajectory::Layout,
 };
+use serde::{Deserialize, Serialize};
 
 /// What a client must know of a model.
 #[derive(Clone, Debug, PartialEq)]
@@ -79,7 +80,8 @@ pub struct Executed {
 }
 
 /// The answer to one observation.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Chunk {
     /// `(action_horizon, action_dim)`, raw units.
     pub actions: Vec<Vec<f32>>,
@@ -106,8 +108,27 @@ pub struct Chunk {
     pub degraded: bool,
 }
 
+impl Chunk {
+    /// Whether all its numbers are.
+    pub fn is_finite(&self) -> bool {
+        let Self { actions, planned_states, latent_mean, latent_log_var, predicted_state, value, value_spread, .. } = self;
+        let rows = actions.iter().chain(planned_states).chain([latent_mean, latent_log_var, predicted_state]);
+        rows.flatten().chain(value).chain(value_spread).all(|value| value.is_finite())
+    }
+
+    /// Whether a model could have said it: rows of its sizes, all numbers finite.
+    pub fn fits(&self, spec: &Spec) -> bool {
+        let Self { actions, planned_states, latent_mean, latent_log_var, predicted_state, .. } = self;
+        let rows = |rows: &[Vec<f32>], width: usize| rows.len() <= spec.plan_horizon && rows.iter().all(|row| row.len() == width);
+        let none_or = |values: &[f32], width: usize| [0, width].contains(&values.len());
+        let latents = [latent_mean, latent_log_var].into_iter().all(|values| none_or(values, spec.latent_dim));
+        let states = rows(planned_states, spec.layout.state_dim) && none_or(predicted_state, spec.layout.state_dim);
+        rows(actions, spec.layout.action_dim) && states && latents && self.is_finite()
+    }
+}
+
 /// How the window of an act started.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Start {
     /// From pure noise.
     Cold,
@@ -152,6 +173,14 @@ pub enum AgentError {
     HistoryNotKept {
         /// What asks for it.
         field: &'static str,
+    },
+    /// A saved episode is none of this model.
+    #[error("{field}: {reason}")]
+    InvalidEpisode {
+        /// What of it.
+        field: &'static str,
+        /// What is wrong and what is expected.
+        reason: String,
     },
     /// The network answered with NaN or infinity.
     #[error("the network's output is not finite")]

@@ -6,6 +6,7 @@ use crate::model::{
     columns::{Bounds, Columns},
     noise::{Noise, Slot},
 };
+use serde::{Deserialize, Serialize};
 
 /// What all windows of a model go by.
 #[derive(Clone, Copy)]
@@ -38,7 +39,8 @@ pub struct Sampling {
 }
 
 /// A window between two acts.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Window {
     /// `T * D` values, normalized units.
     pub x: Vec<f32>,

@@ -12,7 +12,7 @@ use crate::{
         error::ServiceError,
         options::OptionsPatch,
         registry::Model,
-        request::{ActRequest, ActResult, Acted, Caller, Face, ListRequest, OpenRequest, ResetRequest},
+        request::{ActRequest, ActResult, Acted, Caller, Face, ForkRequest, ImportRequest, ListRequest, OpenRequest, ResetRequest},
         session::{Answer, Detail, Summary, Timings},
     },
 };
@@ -24,6 +24,16 @@ pub fn open_request(request: pb::OpenSessionRequest) -> Checked<OpenRequest> {
     let pb::OpenSessionRequest { model, seed, options, ttl_ms, request_id, history } = request;
     let options = options.map_or(Ok(OptionsPatch::default()), options_patch)?;
     Ok(OpenRequest { model, seed, options, ttl_ms, request_id, history: steps(history) })
+}
+
+pub fn import_request(request: pb::ImportSessionRequest) -> ImportRequest {
+    let pb::ImportSessionRequest { record, ttl_ms, request_id } = request;
+    ImportRequest { record, ttl_ms, request_id }
+}
+
+pub fn fork_request(request: pb::ForkSessionRequest) -> ForkRequest {
+    let pb::ForkSessionRequest { session_id, seed, ttl_ms, request_id, step, episode } = request;
+    ForkRequest { session_id, seed, ttl_ms, request_id, step, episode }
 }
 
 pub fn reset_request(request: pb::ResetSessionRequest) -> ResetRequest {

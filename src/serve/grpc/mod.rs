@@ -113,6 +113,14 @@ fn timeout(metadata: &MetadataMap) -> Option<Duration> {
     }
 }
 
+fn opened(opened: Result<Opened, ServiceError>) -> Answer<pb::OpenSessionResponse> {
+    let Opened { session, model, untold } = opened.map_err(refuse)?;
+    let answer = pb::OpenSessionResponse { session: Some(convert::session(session)), model: Some(convert::model(&model)) };
+    let mut response = Response::new(answer);
+    untold.map(|untold| response.extensions_mut().insert(untold));
+    Ok(response)
+}
+
 /// The connection that a request came by.
 fn client<T>(request: &Request<T>) -> u64 {
     request.extensions().get::<Gate>().map_or(0, Gate::client)
@@ -124,11 +132,21 @@ impl agent_server::Agent for Face {
 
     async fn open_session(&self, request: Request<pb::OpenSessionRequest>) -> Answer<pb::OpenSessionResponse> {
         let request = convert::open_request(request.into_inner()).map_err(refuse)?;
-        let Opened { session, model, untold } = self.0.open(request).map_err(refuse)?;
-        let answer = pb::OpenSessionResponse { session: Some(convert::session(session)), model: Some(convert::model(&model)) };
-        let mut response = Response::new(answer);
-        untold.map(|untold| response.extensions_mut().insert(untold));
-        Ok(response)
+        opened(self.0.open(request))
+    }
+
+    async fn export_session(&self, request: Request<pb::ExportSessionRequest>) -> Answer<pb::ExportSessionResponse> {
+        let pb::ExportSessionRequest { session_id } = request.into_inner();
+        let record = self.0.export(&session_id).map_err(refuse)?;
+        Ok(Response::new(pb::ExportSessionResponse { record }))
+    }
+
+    async fn import_session(&self, request: Request<pb::ImportSessionRequest>) -> Answer<pb::OpenSessionResponse> {
+        opened(self.0.import(convert::import_request(request.into_inner())))
+    }
+
+    async fn fork_session(&self, request: Request<pb::ForkSessionRequest>) -> Answer<pb::OpenSessionResponse> {
+        opened(self.0.fork(convert::fork_request(request.into_inner())))
     }
 
     async fn act(&self, request: Request<pb::ActRequest>) -> Answer<pb::ActResponse> {

@@ -15,7 +15,8 @@ pub fn code(error: &ServiceError) -> Code {
         ServiceError::SessionNotFound
         | ServiceError::SessionExpired
         | ServiceError::SessionEvicted
-        | ServiceError::ModelNotFound { .. } => Code::NotFound,
+        | ServiceError::ModelNotFound { .. }
+        | ServiceError::ModelGone { .. } => Code::NotFound,
         ServiceError::TooLarge { .. } | ServiceError::QueueFull { .. } | ServiceError::Quota { .. } => Code::ResourceExhausted,
         ServiceError::Deadline { .. } => Code::DeadlineExceeded,
         ServiceError::Draining { .. } | ServiceError::NotReady { .. } => Code::Unavailable,

@@ -9,6 +9,7 @@ use crate::{
         session::{Answer, Summary, Timings},
     },
 };
+use base64::{Engine, prelude::BASE64_STANDARD};
 use serde::Serialize;
 use std::time::Duration;
 use utoipa::ToSchema;
@@ -49,6 +50,21 @@ pub struct ActAnswer {
     /// Standard deviation of that over the candidates.
     #[serde(skip_serializing_if = "Option::is_none")]
     value_spread: Option<f32>,
+}
+
+/// Answer of ExportSession.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct ExportAnswer {
+    /// In base64.
+    #[schema(format = "byte")]
+    record: String,
+}
+
+impl ExportAnswer {
+    /// Of the record's bytes.
+    pub fn of(record: &[u8]) -> Self {
+        Self { record: BASE64_STANDARD.encode(record) }
+    }
 }
 
 /// Where the time went.

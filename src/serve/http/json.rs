@@ -3,10 +3,12 @@
 use crate::{
     model::agent::{Executed, Observation},
     serve::{
+        error::ServiceError,
         options::OptionsPatch,
-        request::{ActRequest, Caller, Face, OpenRequest, ResetRequest},
+        request::{ActRequest, Caller, Face, ForkRequest, ImportRequest, OpenRequest, ResetRequest},
     },
 };
+use base64::{Engine, prelude::BASE64_STANDARD};
 use serde::Deserialize;
 use std::time::Duration;
 use utoipa::{IntoParams, ToSchema};
@@ -109,6 +111,58 @@ impl ResetBody {
     pub fn into_request(self, session_id: String) -> ResetRequest {
         let Self { seed, keep_history, request_id, episode } = self;
         ResetRequest { session_id, seed, keep_history: keep_history.unwrap_or(false), request_id: request_id.unwrap_or_default(), episode }
+    }
+}
+
+/// ImportSession.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ImportBody {
+    /// From ExportSession, whose answer is a body for this as it is.
+    #[schema(format = "byte")]
+    record: String,
+    /// Idle time to live; absent: that of the exported session.
+    #[schema(format = "uint64")]
+    ttl_ms: Option<u64>,
+    /// As in OpenSession.
+    request_id: Option<String>,
+}
+
+impl TryFrom<ImportBody> for ImportRequest {
+    type Error = ServiceError;
+
+    fn try_from(body: ImportBody) -> Result<Self, ServiceError> {
+        let ImportBody { record, ttl_ms, request_id } = body;
+        let record = BASE64_STANDARD.decode(record).map_err(|error| ServiceError::invalid("record", format!("is no base64: {error}")))?;
+        Ok(Self { record, ttl_ms, request_id: request_id.unwrap_or_default() })
+    }
+}
+
+/// ForkSession.
+#[derive(Debug, Default, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct ForkBody {
+    /// Seed of the noise from now on; absent: that of the session, so that both have the same future.
+    #[schema(format = "uint64")]
+    seed: Option<u64>,
+    /// Idle time to live; absent: that of the session.
+    #[schema(format = "uint64")]
+    ttl_ms: Option<u64>,
+    /// As in OpenSession.
+    request_id: Option<String>,
+    /// The committed step that it goes on from; absent: whichever it is.
+    #[schema(format = "uint64")]
+    step: Option<u64>,
+    /// The episode of that step; absent: the running one.
+    #[schema(format = "uint64")]
+    episode: Option<u64>,
+}
+
+impl ForkBody {
+    /// The fork of this session.
+    pub fn into_request(self, session_id: String) -> ForkRequest {
+        let Self { seed, ttl_ms, request_id, step, episode } = self;
+        ForkRequest { session_id, seed, ttl_ms, request_id: request_id.unwrap_or_default(), step, episode }
     }
 }
 

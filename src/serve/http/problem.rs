@@ -51,7 +51,7 @@ pub fn status(error: &ServiceError) -> StatusCode {
         ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } | ServiceError::EpisodeOver { .. } => StatusCode::CONFLICT,
         ServiceError::StepPayloadMismatch { .. } => StatusCode::UNPROCESSABLE_ENTITY,
         ServiceError::SessionNotFound | ServiceError::ModelNotFound { .. } => StatusCode::NOT_FOUND,
-        ServiceError::SessionExpired | ServiceError::SessionEvicted => StatusCode::GONE,
+        ServiceError::SessionExpired | ServiceError::SessionEvicted | ServiceError::ModelGone { .. } => StatusCode::GONE,
         ServiceError::TooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
         ServiceError::QueueFull { .. } | ServiceError::Quota { .. } => StatusCode::TOO_MANY_REQUESTS,
         ServiceError::Deadline { .. } => StatusCode::GATEWAY_TIMEOUT,

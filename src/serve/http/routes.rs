@@ -2,9 +2,9 @@
 
 use super::{
     Gate, State,
-    answer::{ActAnswer, BatchAnswer, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer},
+    answer::{ActAnswer, BatchAnswer, ExportAnswer, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer},
     body::{bytes, parse, unfitting},
-    json::{ActBody, BatchBody, ListQuery, OpenBody, ResetBody, View},
+    json::{ActBody, BatchBody, ForkBody, ImportBody, ListQuery, OpenBody, ResetBody, View},
     problem::Problem,
     stream,
 };
@@ -50,6 +50,9 @@ fn documented() -> OpenApiRouter<State> {
         .routes(routes!(open_session, list_sessions))
         .routes(routes!(get_session, close_session))
         .routes(routes!(reset_session))
+        .routes(routes!(export_session))
+        .routes(routes!(import_session))
+        .routes(routes!(fork_session))
         .routes(routes!(act))
         .routes(routes!(act_stream))
         .routes(routes!(act_batch))
@@ -131,13 +134,44 @@ async fn read<T: DeserializeOwned>(body: Body, state: &State) -> Result<T, Probl
     Ok(parse(&bytes(body, state.service.config()).await?)?)
 }
 
+/// A body that may be left out.
+async fn read_if_any<T: DeserializeOwned + Default>(body: Body, state: &State) -> Result<T, Problem> {
+    let bytes = bytes(body, state.service.config()).await?;
+    if bytes.is_empty() { Ok(T::default()) } else { Ok(parse(&bytes)?) }
+}
+
 /// OpenSession
 #[utoipa::path(post, path = "/v1/sessions", request_body = OpenBody, responses((status = 201, description = "The session and its model", body = OpenAnswer), Problem))]
 async fn open_session(Shared(state): Shared<State>, body: Body) -> Result<Response, Problem> {
     let request: OpenBody = read(body, &state).await?;
-    let Opened { session, model, untold } = state.service.open(request.into())?;
+    Ok(opened(state.service.open(request.into())?))
+}
+
+fn opened(Opened { session, model, untold }: Opened) -> Response {
     let answer = (StatusCode::CREATED, Json(OpenAnswer { session: session.into(), model: (&model).into() }));
-    Ok((untold.map(Extension), answer).into_response())
+    (untold.map(Extension), answer).into_response()
+}
+
+/// ExportSession
+#[utoipa::path(get, path = "/v1/sessions/{id}/export", params(("id" = String, Path)),
+    responses((status = 200, description = "The session as bytes; a body for ImportSession as it is", body = ExportAnswer), Problem))]
+async fn export_session(Shared(state): Shared<State>, Named(id): Named) -> Answer<ExportAnswer> {
+    Ok(Json(ExportAnswer::of(&state.service.export(&id)?)))
+}
+
+/// ImportSession
+#[utoipa::path(post, path = "/v1/sessions:import", request_body = ImportBody, responses((status = 201, description = "The session, and its model", body = OpenAnswer), Problem))]
+async fn import_session(Shared(state): Shared<State>, body: Body) -> Result<Response, Problem> {
+    let request: ImportBody = read(body, &state).await?;
+    Ok(opened(state.service.import(request.try_into()?)?))
+}
+
+/// ForkSession
+#[utoipa::path(post, path = "/v1/sessions/{id}/fork", params(("id" = String, Path)), request_body = ForkBody,
+    responses((status = 201, description = "The new session, and its model", body = OpenAnswer), Problem))]
+async fn fork_session(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Result<Response, Problem> {
+    let body: ForkBody = read_if_any(body, &state).await?;
+    Ok(opened(state.service.fork(body.into_request(id))?))
 }
 
 /// ListSessions
@@ -167,8 +201,7 @@ async fn close_session(Shared(state): Shared<State>, Named(id): Named) -> Result
 #[utoipa::path(post, path = "/v1/sessions/{id}/reset", params(("id" = String, Path)), request_body = ResetBody,
     responses((status = 200, description = "The session", body = OneSession), Problem))]
 async fn reset_session(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Answer<OneSession> {
-    let bytes = bytes(body, state.service.config()).await?;
-    let body: ResetBody = if bytes.is_empty() { ResetBody::default() } else { parse(&bytes)? };
+    let body: ResetBody = read_if_any(body, &state).await?;
     let session = state.service.reset(body.into_request(id))?;
     Ok(Json(OneSession { session: session.into() }))
 }

@@ -161,7 +161,7 @@ mod tests {
         model::{agent::Observation, checkpoint},
         serve::{
             config::SessionsConfig,
-            session::{Answer, Entry, Opening, Sessions, Timings, key_of},
+            session::{Answer, Entry, Opening, Sessions, Standing, Timings, key_of},
         },
     };
     use std::{path::Path, thread, time::Duration};
@@ -174,7 +174,7 @@ mod tests {
         let episode = agent.open(1, &options).unwrap();
         let seen = Observation { state: vec![0.1; 4], ..Observation::default() };
         let (after, chunk) = agent.act(&episode, &seen).unwrap();
-        let opening = Opening { model: "tiny".into(), agent, episode: episode.clone(), options, ttl, request_id };
+        let opening = Opening { model: "tiny".into(), agent, episode: episode.clone(), standing: Standing::default(), ttl, request_id };
         let session = Sessions::new(SessionsConfig::default()).open(opening, Instant::now()).unwrap();
         let (mut told, mut silent) = (0, 0);
         for turn in 0..4_000 {

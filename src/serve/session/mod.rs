@@ -3,12 +3,14 @@
 mod flight;
 mod handle;
 mod key;
+mod record;
 mod table;
 mod untold;
 
 pub use flight::{Flight, Waiter};
 pub use handle::Handle;
 pub use key::{Key, key_of};
+pub use record::{Last, Record, Unreadable};
 pub use table::Sessions;
 pub use untold::Untold;
 
@@ -20,6 +22,7 @@ use crate::{
     serve::{engine::Patience, error::ServiceError},
 };
 use parking_lot::Mutex;
+use serde::{Deserialize, Serialize};
 use std::{
     collections::VecDeque,
     sync::{
@@ -54,7 +57,8 @@ pub struct Answer {
 }
 
 /// Where the time of an act went.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Timings {
     /// Waiting for a worker.
     pub queue: Duration,
@@ -72,14 +76,27 @@ pub struct Opening {
     pub model: Arc<str>,
     /// The model.
     pub agent: Arc<Agent>,
-    /// The first episode.
+    /// The episode that it goes on with.
     pub episode: Episode,
-    /// Options it was opened with, for later episodes.
-    pub options: SamplerOptions,
+    /// Where it stands.
+    pub standing: Standing,
     /// Idle time to live.
     pub ttl: Duration,
     /// The client's name for the request; empty: none.
     pub request_id: String,
+}
+
+/// Where a session stands in its episodes. The default one is new.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Standing {
+    /// Acts committed in the running episode.
+    pub step: u64,
+    /// How often it was reset.
+    pub resets: u64,
+    /// Names of the last requests that reset it.
+    pub reset_ids: Vec<String>,
+    /// The answer of the last act.
+    pub last: Option<Last>,
 }
 
 /// One session. Its slot is locked for moments only, never while a model runs or across an await.
@@ -181,18 +198,17 @@ pub struct Detail {
 
 impl Session {
     fn new(opening: Opening, bytes_total: Arc<AtomicUsize>, now: Instant) -> Self {
-        let Opening { model, agent, episode, options, ttl, request_id } = opening;
+        let Opening { model, agent, episode, standing, ttl, request_id } = opening;
+        let Standing { step, resets, reset_ids, last } = standing;
+        let options = episode.options().clone();
         bytes_total.fetch_add(episode.size_bytes(), Ordering::Relaxed);
-        let slot = Slot {
-            touched: now,
-            used: false,
-            resets: 0,
-            reset_ids: VecDeque::new(),
-            committed: Committed::fresh(episode),
-            flight: None,
-            ended: false,
-        };
         let id = Uuid::new_v4();
+        let answer = |Last { key, chunk, timings }| {
+            let (model, model_digest) = (model.clone(), agent.spec().digest.clone());
+            (key, Arc::new(Answer { session: id, step, chunk, timings, model, model_digest }))
+        };
+        let committed = Committed { step, episode: Arc::new(episode), last: last.map(answer) };
+        let slot = Slot { touched: now, used: false, resets, reset_ids: reset_ids.into(), committed, flight: None, ended: false };
         Self { id, handle: Handle::of(id), model, agent, options, request_id, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
     }
 
@@ -303,6 +319,30 @@ impl Session {
         slot.touched = now;
         slot.committed = Committed::fresh(episode);
         Ok(())
+    }
+
+    /// Idle time to live.
+    pub fn ttl(&self) -> Duration {
+        self.ttl
+    }
+
+    /// The running episode and where the session stands in it, if it stands there. An act in flight is no part of it.
+    ///
+    /// # Errors
+    /// If the episode is over, the step is another one, or the session has ended.
+    pub fn standing(&self, (episode, step): (Option<u64>, Option<u64>)) -> Result<(Arc<Episode>, Standing), ServiceError> {
+        let slot = self.slot.lock();
+        if slot.ended {
+            return Err(ServiceError::SessionNotFound);
+        }
+        slot.check_episode(episode)?;
+        let committed = slot.committed.step;
+        if let Some(step) = step.filter(|step| *step != committed) {
+            return Err(ServiceError::StepOutOfOrder { step, committed });
+        }
+        let reset_ids = slot.reset_ids.iter().cloned().collect();
+        let last = slot.committed.last.as_ref().map(|(key, answer)| Last::of(*key, answer));
+        Ok((slot.committed.episode.clone(), Standing { step: committed, resets: slot.resets, reset_ids, last }))
     }
 
     /// The session in numbers, for whoever knows its id.

@@ -341,7 +341,7 @@ impl Shard {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::checkpoint;
+    use crate::{model::checkpoint, serve::session::Standing};
     use std::path::Path;
 
     const MINUTE: Duration = Duration::from_secs(60);
@@ -351,7 +351,7 @@ mod tests {
         let opening = move || {
             let (options, ttl) = (agent.config().defaults.sampler.clone(), 60 * MINUTE);
             let episode = agent.open(1, &options).unwrap();
-            Opening { model: "tiny".into(), agent: agent.clone(), episode, options, ttl, request_id: String::new() }
+            Opening { model: "tiny".into(), agent: agent.clone(), episode, standing: Standing::default(), ttl, request_id: String::new() }
         };
         (Sessions::new(SessionsConfig { len_max, evict_idle_ms: 60_000, ..SessionsConfig::default() }), opening)
     }

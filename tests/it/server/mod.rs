@@ -13,6 +13,7 @@ mod late;
 mod lifecycle;
 mod limits;
 mod methods;
+mod records;
 mod steps;
 mod streams;
 

@@ -10,7 +10,7 @@ from typing import Protocol
 from urllib.parse import urlsplit
 
 from ada_diffuser.errors import AdaError
-from ada_diffuser.messages import ActCall, Chunk, Model, OpenCall, SessionSummary
+from ada_diffuser.messages import ActCall, Chunk, ForkCall, Model, OpenCall, SessionSummary
 
 
 class Face(Protocol):
@@ -29,6 +29,12 @@ class Face(Protocol):
     def get_session(self, session_id: str, timeout_s: float) -> SessionSummary: ...
 
     def list_sessions(self, model: str, page_size: int, page_token: str, timeout_s: float) -> tuple[list[SessionSummary], str]: ...
+
+    def export_session(self, session_id: str, timeout_s: float) -> bytes: ...
+
+    def import_session(self, record: bytes, ttl_ms: int | None, request_id: str, timeout_s: float) -> tuple[SessionSummary, Model]: ...
+
+    def fork_session(self, call: ForkCall, timeout_s: float) -> tuple[SessionSummary, Model]: ...
 
     def close_session(self, session_id: str, timeout_s: float) -> None: ...
 

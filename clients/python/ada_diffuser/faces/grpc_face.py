@@ -14,6 +14,7 @@ from ada_diffuser.messages import (
     ActCall,
     Chunk,
     ExecutedValues,
+    ForkCall,
     Missing,
     Model,
     OpenCall,
@@ -66,8 +67,27 @@ class GrpcFace:
             request_id=call.request_id,
             history=map(_executed, call.history),
         )
-        answer = self._call(self._agent.OpenSession, request, timeout_s)
-        return _summary(answer.session), _model(answer.model)
+        return _opened(self._call(self._agent.OpenSession, request, timeout_s))
+
+    def export_session(self, session_id: str, timeout_s: float) -> bytes:
+        request = agent_pb2.ExportSessionRequest(session_id=session_id)
+        record: bytes = self._call(self._agent.ExportSession, request, timeout_s).record
+        return record
+
+    def import_session(self, record: bytes, ttl_ms: int | None, request_id: str, timeout_s: float) -> tuple[SessionSummary, Model]:
+        request = agent_pb2.ImportSessionRequest(record=record, ttl_ms=ttl_ms, request_id=request_id)
+        return _opened(self._call(self._agent.ImportSession, request, timeout_s))
+
+    def fork_session(self, call: ForkCall, timeout_s: float) -> tuple[SessionSummary, Model]:
+        request = agent_pb2.ForkSessionRequest(
+            session_id=call.session_id,
+            seed=call.seed,
+            ttl_ms=call.ttl_ms,
+            request_id=call.request_id,
+            step=call.step,
+            episode=call.episode,
+        )
+        return _opened(self._call(self._agent.ForkSession, request, timeout_s))
 
     def act(self, call: ActCall, timeout_s: float) -> Chunk:
         return _chunk(self._call(self._agent.Act, _act_request(call), timeout_s))
@@ -267,6 +287,10 @@ def _true_context(context: models_pb2.TrueContext) -> TrueContext:
 def _trained(trained: models_pb2.Trained) -> Trained:
     missing = Missing(trained.missing.state, trained.missing.action, trained.missing.reward)
     return Trained(tuple(trained.action_horizons), tuple(trained.sub_steps), missing, trained.sessions)
+
+
+def _opened(answer: agent_pb2.OpenSessionResponse) -> tuple[SessionSummary, Model]:
+    return _summary(answer.session), _model(answer.model)
 
 
 def _summary(session: agent_pb2.Session) -> SessionSummary:

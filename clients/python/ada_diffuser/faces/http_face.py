@@ -22,7 +22,7 @@ from urllib.parse import quote, urlencode
 
 from ada_diffuser.errors import AdaError, DeadlineExceeded, Detail, Unavailable, UnexpectedAnswer, from_detail
 from ada_diffuser.faces import http_json
-from ada_diffuser.messages import ActCall, Chunk, Model, OpenCall, SessionSummary
+from ada_diffuser.messages import ActCall, Chunk, ForkCall, Model, OpenCall, SessionSummary
 
 #: A longer body is announced before it is sent: a server that finds it too large says so, and need not be sent all of it.
 _ANNOUNCED_LEN = 256 * 1024
@@ -41,8 +41,19 @@ class HttpFace:
         self._lock = threading.Lock()
 
     def open_session(self, call: OpenCall, timeout_s: float) -> tuple[SessionSummary, Model]:
-        answer = self._call("POST", "/v1/sessions", http_json.open_body(call), timeout_s)
-        return http_json.read(http_json.summary, answer, "session"), http_json.read(http_json.model, answer, "model")
+        return _opened(self._call("POST", "/v1/sessions", http_json.open_body(call), timeout_s))
+
+    def export_session(self, session_id: str, timeout_s: float) -> bytes:
+        answer = self._call("GET", f"/v1/sessions/{_quoted(session_id)}/export", None, timeout_s)
+        return http_json.read(http_json.binary, answer, "record")
+
+    def import_session(self, record: bytes, ttl_ms: int | None, request_id: str, timeout_s: float) -> tuple[SessionSummary, Model]:
+        body = http_json.without_none(record=http_json.binary_out(record), ttl_ms=ttl_ms, request_id=request_id)
+        return _opened(self._call("POST", "/v1/sessions:import", body, timeout_s))
+
+    def fork_session(self, call: ForkCall, timeout_s: float) -> tuple[SessionSummary, Model]:
+        body = http_json.without_none(seed=call.seed, ttl_ms=call.ttl_ms, request_id=call.request_id, step=call.step, episode=call.episode)
+        return _opened(self._call("POST", f"/v1/sessions/{_quoted(call.session_id)}/fork", body, timeout_s))
 
     def act(self, call: ActCall, timeout_s: float) -> Chunk:
         body = http_json.act_body(call)
@@ -230,6 +241,10 @@ def _is_alive(idle: socket.socket) -> bool:
     except OSError:
         return False
     return False
+
+
+def _opened(answer: Any) -> tuple[SessionSummary, Model]:
+    return http_json.read(http_json.summary, answer, "session"), http_json.read(http_json.model, answer, "model")
 
 
 def _quoted(word: str) -> str:

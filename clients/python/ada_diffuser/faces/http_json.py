@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -94,6 +95,16 @@ def options_out(options: SamplerOptions) -> dict[str, Any]:
 
 def _options_in(options: Mapping[str, Any]) -> SamplerOptions:
     return SamplerOptions.received(options, _READ)
+
+
+def binary(text: str) -> bytes:
+    """What stands in the JSON as base64."""
+    return base64.b64decode(text, validate=True)
+
+
+def binary_out(value: bytes) -> str:
+    """The same on its way out."""
+    return base64.b64encode(value).decode()
 
 
 def read(convert: Callable[[Any], T], answer: Any, *path: str) -> T:

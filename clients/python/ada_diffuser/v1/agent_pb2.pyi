@@ -282,6 +282,44 @@ class CloseSessionResponse(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
+class ExportSessionRequest(_message.Message):
+    __slots__ = ("session_id",)
+    SESSION_ID_FIELD_NUMBER: _ClassVar[int]
+    session_id: str
+    def __init__(self, session_id: _Optional[str] = ...) -> None: ...
+
+class ExportSessionResponse(_message.Message):
+    __slots__ = ("record",)
+    RECORD_FIELD_NUMBER: _ClassVar[int]
+    record: bytes
+    def __init__(self, record: _Optional[bytes] = ...) -> None: ...
+
+class ImportSessionRequest(_message.Message):
+    __slots__ = ("record", "ttl_ms", "request_id")
+    RECORD_FIELD_NUMBER: _ClassVar[int]
+    TTL_MS_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
+    record: bytes
+    ttl_ms: int
+    request_id: str
+    def __init__(self, record: _Optional[bytes] = ..., ttl_ms: _Optional[int] = ..., request_id: _Optional[str] = ...) -> None: ...
+
+class ForkSessionRequest(_message.Message):
+    __slots__ = ("session_id", "seed", "ttl_ms", "request_id", "step", "episode")
+    SESSION_ID_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    TTL_MS_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    EPISODE_FIELD_NUMBER: _ClassVar[int]
+    session_id: str
+    seed: int
+    ttl_ms: int
+    request_id: str
+    step: int
+    episode: int
+    def __init__(self, session_id: _Optional[str] = ..., seed: _Optional[int] = ..., ttl_ms: _Optional[int] = ..., request_id: _Optional[str] = ..., step: _Optional[int] = ..., episode: _Optional[int] = ...) -> None: ...
+
 class Session(_message.Message):
     __slots__ = ("session_id", "model", "model_digest", "seed", "committed_step", "episode", "options", "latent_mean", "latent_log_var", "age_ms", "idle_ms", "ttl_ms", "state_bytes", "busy", "handle")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]

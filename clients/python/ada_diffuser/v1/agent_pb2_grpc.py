@@ -86,6 +86,21 @@ class AgentStub(object):
                 request_serializer=ada__diffuser_dot_v1_dot_agent__pb2.CloseSessionRequest.SerializeToString,
                 response_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.CloseSessionResponse.FromString,
                 _registered_method=True)
+        self.ExportSession = channel.unary_unary(
+                '/ada_diffuser.v1.Agent/ExportSession',
+                request_serializer=ada__diffuser_dot_v1_dot_agent__pb2.ExportSessionRequest.SerializeToString,
+                response_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.ExportSessionResponse.FromString,
+                _registered_method=True)
+        self.ImportSession = channel.unary_unary(
+                '/ada_diffuser.v1.Agent/ImportSession',
+                request_serializer=ada__diffuser_dot_v1_dot_agent__pb2.ImportSessionRequest.SerializeToString,
+                response_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.FromString,
+                _registered_method=True)
+        self.ForkSession = channel.unary_unary(
+                '/ada_diffuser.v1.Agent/ForkSession',
+                request_serializer=ada__diffuser_dot_v1_dot_agent__pb2.ForkSessionRequest.SerializeToString,
+                response_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.FromString,
+                _registered_method=True)
 
 
 class AgentServicer(object):
@@ -160,6 +175,28 @@ class AgentServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ExportSession(self, request, context):
+        """A session as bytes, as it is committed at this moment: to go on with it elsewhere, or later, or twice. The session itself goes on.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ImportSession(self, request, context):
+        """Another session, which goes on from where the exported one stood: same observations, same bytes as there, the answer of its last act included. NOT_FOUND
+        (MODEL_GONE) where the checkpoint that it began on is not served, under whatever name.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ForkSession(self, request, context):
+        """Another session, which goes on from where this one stands, with the same future or another one.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_AgentServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -202,6 +239,21 @@ def add_AgentServicer_to_server(servicer, server):
                     servicer.CloseSession,
                     request_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.CloseSessionRequest.FromString,
                     response_serializer=ada__diffuser_dot_v1_dot_agent__pb2.CloseSessionResponse.SerializeToString,
+            ),
+            'ExportSession': grpc.unary_unary_rpc_method_handler(
+                    servicer.ExportSession,
+                    request_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.ExportSessionRequest.FromString,
+                    response_serializer=ada__diffuser_dot_v1_dot_agent__pb2.ExportSessionResponse.SerializeToString,
+            ),
+            'ImportSession': grpc.unary_unary_rpc_method_handler(
+                    servicer.ImportSession,
+                    request_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.ImportSessionRequest.FromString,
+                    response_serializer=ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.SerializeToString,
+            ),
+            'ForkSession': grpc.unary_unary_rpc_method_handler(
+                    servicer.ForkSession,
+                    request_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.ForkSessionRequest.FromString,
+                    response_serializer=ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -432,6 +484,87 @@ class Agent(object):
             '/ada_diffuser.v1.Agent/CloseSession',
             ada__diffuser_dot_v1_dot_agent__pb2.CloseSessionRequest.SerializeToString,
             ada__diffuser_dot_v1_dot_agent__pb2.CloseSessionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ExportSession(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ada_diffuser.v1.Agent/ExportSession',
+            ada__diffuser_dot_v1_dot_agent__pb2.ExportSessionRequest.SerializeToString,
+            ada__diffuser_dot_v1_dot_agent__pb2.ExportSessionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ImportSession(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ada_diffuser.v1.Agent/ImportSession',
+            ada__diffuser_dot_v1_dot_agent__pb2.ImportSessionRequest.SerializeToString,
+            ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ForkSession(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ada_diffuser.v1.Agent/ForkSession',
+            ada__diffuser_dot_v1_dot_agent__pb2.ForkSessionRequest.SerializeToString,
+            ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.FromString,
             options,
             channel_credentials,
             insecure,

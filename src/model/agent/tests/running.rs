@@ -3,7 +3,7 @@
 use super::*;
 use crate::model::method::{Baseline, LatentSource};
 
-fn running() -> Agent {
+pub(super) fn running() -> Agent {
     running_beside(None, Future::Held)
 }
 

@@ -5,7 +5,7 @@ use crate::model::method::{Decoding, Diffused, Guide, Head, LatentSource, Told};
 
 const SKILL_STEPS: u64 = 4;
 
-fn of_skills(action: Decoding) -> Agent {
+pub(super) fn of_skills(action: Decoding) -> Agent {
     agent_with(false, 2, Backbone::Mlp { width: 16, depth: 2, dropout: 0.0 }, |config| {
         let plan = &mut config.method.plan;
         (plan.diffused, plan.horizon, plan.level_max) = (Diffused::Code { dim: 5, steps: SKILL_STEPS as usize }, 1, 20);

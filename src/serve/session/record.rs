@@ -1,0 +1,240 @@
+//! A session as bytes: what is needed to go on with it elsewhere, or later, as if nothing had been between.
+//!
+//! `ADAS`, one byte of version, the CRC-32C of what follows (little-endian), then a [`Record`] as MessagePack with the names of its fields. A reader
+//! takes its own version and the one before; what was damaged on its way is refused, never repaired. A checksum is no seal: whoever imports a
+//! record may have written it by hand, so that everything in it is checked against the model ([`Agent::adopt`]).
+
+use super::{Answer, Key, RESET_IDS_MAX, Session, Standing, Timings};
+use crate::{
+    model::agent::{Agent, Chunk, Episode},
+    serve::error::ServiceError,
+};
+use crc::{CRC_32_ISCSI, Crc};
+use serde::{Deserialize, Serialize};
+
+const MAGIC: [u8; 4] = *b"ADAS";
+/// Of what is written.
+const VERSION: u8 = 1;
+/// Steps and episodes that are counted.
+const COUNT_MAX: u64 = 1 << 53;
+const HEAD_LEN: usize = MAGIC.len() + 1 + size_of::<u32>();
+const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
+
+/// What is written down of a session.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Record {
+    /// Name of the model.
+    pub model: String,
+    /// Its digest: the episode is of these weights and no others.
+    pub model_digest: String,
+    /// Idle time to live, in milliseconds.
+    pub ttl_ms: u64,
+    /// Acts committed in the running episode.
+    pub step: u64,
+    /// How often the session was reset.
+    pub resets: u64,
+    /// Names of the last requests that reset it.
+    pub reset_ids: Vec<String>,
+    /// The running episode.
+    pub episode: Episode,
+    /// The last answer, for whoever lost it.
+    pub last: Option<Last>,
+}
+
+/// The last answer, and the key of its question.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Last {
+    /// See [`super::key_of`].
+    pub key: Key,
+    /// What the model said.
+    pub chunk: Chunk,
+    /// Where the time went.
+    pub timings: Timings,
+}
+
+/// Why bytes are no record that can be read.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Unreadable {
+    /// They begin with something else.
+    #[error("is no session that was exported")]
+    Foreign,
+    /// A newer server wrote them.
+    #[error("is of format {0}, and this server reads up to {VERSION}: import it into the server's version that wrote it, or a newer one")]
+    Newer(u8),
+    /// They are not what was written.
+    #[error("is damaged: its checksum does not fit, or its end is missing")]
+    Damaged,
+    /// They were written so, but not by a server.
+    #[error("cannot be read: {0}")]
+    Malformed(String),
+}
+
+impl Record {
+    /// Of a session, as it is committed at this moment.
+    ///
+    /// # Errors
+    /// If the session has ended.
+    pub fn of(session: &Session) -> Result<Self, ServiceError> {
+        let (episode, Standing { step, resets, reset_ids, last }) = session.standing((None, None))?;
+        let (model, model_digest) = (session.model.to_string(), session.agent.spec().digest.clone());
+        let ttl_ms = session.ttl().as_millis() as u64;
+        Ok(Self { model, model_digest, ttl_ms, step, resets, reset_ids, episode: (*episode).clone(), last })
+    }
+
+    /// As bytes.
+    ///
+    /// # Errors
+    /// If the format cannot express it, which is a defect.
+    pub fn write(&self) -> Result<Vec<u8>, rmp_serde::encode::Error> {
+        let body = rmp_serde::to_vec_named(self)?;
+        let mut bytes = Vec::with_capacity(HEAD_LEN + body.len());
+        bytes.extend_from_slice(&MAGIC);
+        bytes.push(VERSION);
+        bytes.extend_from_slice(&CRC.checksum(&body).to_le_bytes());
+        bytes.extend_from_slice(&body);
+        Ok(bytes)
+    }
+
+    /// From bytes.
+    ///
+    /// # Errors
+    /// [`Unreadable`].
+    pub fn read(bytes: &[u8]) -> Result<Self, Unreadable> {
+        let rest = bytes.strip_prefix(&MAGIC).ok_or(Unreadable::Foreign)?;
+        let (version, rest) = rest.split_first().ok_or(Unreadable::Damaged)?;
+        let (sum, body) = rest.split_first_chunk().ok_or(Unreadable::Damaged)?;
+        if *version > VERSION {
+            return Err(Unreadable::Newer(*version));
+        }
+        if *version < VERSION || u32::from_le_bytes(*sum) != CRC.checksum(body) {
+            return Err(Unreadable::Damaged);
+        }
+        rmp_serde::from_slice(body).map_err(|error| Unreadable::Malformed(error.to_string()))
+    }
+
+    /// Where its session stood, if the model could have left it there; else what of it is wrong.
+    ///
+    /// # Errors
+    /// `(field, reason)`.
+    pub fn standing(self, agent: &Agent) -> Result<(Episode, Standing), (String, String)> {
+        let Self { model: _, model_digest: _, ttl_ms: _, step, resets, reset_ids, episode, last } = self;
+        let misfit = |field: &str| (field.to_owned(), "is none of this session".to_owned());
+        // Each step has an answer; the next one can be counted.
+        if (step > 0) != last.is_some() || step.max(resets) > COUNT_MAX {
+            return Err(misfit("step"));
+        }
+        if last.as_ref().is_some_and(|last| !last.chunk.fits(agent.spec())) {
+            return Err(misfit("last"));
+        }
+        if reset_ids.len() > RESET_IDS_MAX {
+            return Err(misfit("reset_ids"));
+        }
+        let episode = agent.adopt(episode).map_err(|error| ("episode".to_owned(), error.to_string()))?;
+        Ok((episode, Standing { step, resets, reset_ids, last }))
+    }
+}
+
+impl Last {
+    /// Of a committed answer.
+    pub fn of(key: Key, answer: &Answer) -> Self {
+        let Answer { session: _, step: _, chunk, timings, model: _, model_digest: _ } = answer;
+        Self { key, chunk: chunk.clone(), timings: *timings }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        model::{agent::Observation, checkpoint},
+        serve::session::key_of,
+    };
+    use std::{path::Path, sync::Arc};
+
+    fn acted() -> (Arc<Agent>, Record) {
+        let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
+        let seen = |i: usize| Observation { state: vec![0.1 * i as f32; 4], ..Observation::default() };
+        let mut standing = (agent.open(1, &agent.config().defaults.sampler).unwrap(), None);
+        for i in 0..3 {
+            let (episode, chunk) = agent.act(&standing.0, &seen(i)).unwrap();
+            standing = (episode, Some(Last { key: key_of(&seen(i)), chunk, timings: Timings::default() }));
+        }
+        let (episode, last) = standing;
+        let (model, model_digest, reset_ids) = ("tiny".to_owned(), agent.spec().digest.clone(), vec!["a".to_owned()]);
+        (agent, Record { model, model_digest, ttl_ms: 60_000, step: 3, resets: 1, reset_ids, episode, last })
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let (agent, record) = acted();
+        let bytes = record.write().unwrap();
+        assert!(bytes.len() < 6_000, "{} bytes", bytes.len());
+        let again = Record::read(&bytes).unwrap();
+        assert_eq!(again, record);
+        let (episode, standing) = again.standing(&agent).unwrap();
+        assert_eq!((&episode, standing.step, &standing.last), (&record.episode, 3, &record.last));
+    }
+
+    /// Every byte of it counts, and every cut is noticed.
+    #[test]
+    fn damage_is_noticed() {
+        let bytes = acted().1.write().unwrap();
+        for i in 0..bytes.len() {
+            let mut flipped = bytes.clone();
+            flipped[i] ^= 1 << (i % 8);
+            Record::read(&flipped).unwrap_err();
+            Record::read(&bytes[..i]).unwrap_err();
+        }
+        assert_eq!(Record::read(b"PK"), Err(Unreadable::Foreign));
+        let newer = [&MAGIC[..], &[VERSION + 1], &bytes[5..]].concat();
+        assert_eq!(Record::read(&newer), Err(Unreadable::Newer(VERSION + 1)));
+        assert_eq!(Record::read(&[&bytes[..], &[0]].concat()), Err(Unreadable::Damaged));
+    }
+
+    /// A checksum is no seal: of records that somebody changed and sealed again, none makes an act panic or go on for long.
+    #[test]
+    fn whatever_is_written_by_hand_does_no_harm() {
+        let (agent, record) = acted();
+        let bytes = record.write().unwrap();
+        let (mut malformed, mut refused, mut acted) = (0, 0, 0);
+        for i in HEAD_LEN..bytes.len() {
+            for to in [0x00, 0x7f, 0xc0, 0xca, 0xff, bytes[i] ^ 1] {
+                let mut changed = bytes.clone();
+                changed[i] = to;
+                let sum = CRC.checksum(&changed[HEAD_LEN..]);
+                changed[HEAD_LEN - 4..HEAD_LEN].copy_from_slice(&sum.to_le_bytes());
+                let Ok(read) = Record::read(&changed) else {
+                    malformed += 1;
+                    continue;
+                };
+                let Ok((episode, _)) = read.standing(&agent) else {
+                    refused += 1;
+                    continue;
+                };
+                acted += 1;
+                if let Ok((_, chunk)) = agent.act(&episode, &Observation { state: vec![0.1; 4], ..Observation::default() }) {
+                    assert!(chunk.fits(agent.spec()));
+                }
+            }
+        }
+        assert!(malformed > 1_000 && refused > 100 && acted > 1_000, "{malformed} {refused} {acted}");
+    }
+
+    #[test]
+    fn a_record_hangs_together() {
+        let (agent, record) = acted();
+        let wrong = |change: fn(&mut Record)| {
+            let mut changed = record.clone();
+            change(&mut changed);
+            changed.standing(&agent).unwrap_err().0
+        };
+        assert_eq!(wrong(|record| record.step = 0), "step");
+        assert_eq!(wrong(|record| record.last = None), "step");
+        assert_eq!(wrong(|record| record.resets = u64::MAX), "step");
+        assert_eq!(wrong(|record| record.reset_ids = vec![String::new(); RESET_IDS_MAX + 1]), "reset_ids");
+        assert_eq!(wrong(|record| record.last.iter_mut().for_each(|last| last.chunk.actions[0].push(0.0))), "last");
+        assert_eq!(wrong(|record| record.last.iter_mut().for_each(|last| last.chunk.latent_mean[0] = f32::NAN)), "last");
+    }
+}
