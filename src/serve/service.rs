@@ -174,7 +174,7 @@ impl Service {
     /// ExportSession: what is committed at this moment, as bytes for [`Service::import`] here or elsewhere.
     ///
     /// # Errors
-    /// `SessionNotFound` and its kin, `NotReady`; while draining it goes on, as this is when a session may have to leave.
+    /// `SessionNotFound` and its kin. It goes on while the server drains, as that is when a session may have to leave.
     pub fn export(&self, session_id: &str) -> Result<Vec<u8>, ServiceError> {
         let session = self.sessions.get(parse_id(session_id)?, Instant::now())?;
         Record::of(&session)?.write().map_err(|error| ServiceError::internal(&error))
