@@ -146,8 +146,11 @@ async fn the_faces_describe_themselves() {
         "/v1/sessions",
         "/v1/sessions/{id}",
         "/v1/sessions/{id}/act",
+        "/v1/sessions/{id}/export",
+        "/v1/sessions/{id}/fork",
         "/v1/sessions/{id}/reset",
         "/v1/sessions/{id}/stream",
+        "/v1/sessions:import",
     ];
     assert_eq!(paths, expected);
     assert!(api["components"]["schemas"]["ActBody"]["properties"]["observation"].is_object());
