@@ -11,7 +11,7 @@ use crate::{
         registry::{Model, Registry, RegistryError},
         request::{ActRequest, ActResult, Acted, ForkRequest, ImportRequest, ListRequest, OpenRequest, Opened, Page, ResetRequest},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
-        session::{Answer, Entry, Handle, Opening, Record, Session, Sessions, Standing, Summary, Untold, Waiter, key_of},
+        session::{Answer, Entry, Handle, Opening, Record, Session, Sessions, Standing, Summary, Untold, Waiter, is_request_id, key_of},
         telemetry,
     },
 };
@@ -29,8 +29,6 @@ use uuid::Uuid;
 
 /// Seeds drawn by the server stay below 2^53, so that every JSON reader keeps them exactly.
 const DRAWN_SEED_BITS: u32 = 53;
-/// Longest name that a client may give a request.
-const REQUEST_ID_LEN_MAX: usize = 64;
 const PAGE_LEN: usize = 100;
 const PAGE_LEN_MAX: usize = 100;
 
@@ -455,10 +453,12 @@ fn parse_id(session_id: &str) -> Result<Uuid, ServiceError> {
     Uuid::try_parse(session_id).map_err(|_| ServiceError::SessionNotFound)
 }
 
-/// A name that a log and a header can hold; empty: none.
 fn check_request_id(id: &str) -> Result<(), ServiceError> {
-    let is_name = id.len() <= REQUEST_ID_LEN_MAX && id.bytes().all(|byte| byte.is_ascii_graphic());
-    if is_name { Ok(()) } else { Err(ServiceError::invalid("request_id", "must be 1 to 64 visible ASCII characters")) }
+    if id.is_empty() || is_request_id(id) {
+        Ok(())
+    } else {
+        Err(ServiceError::invalid("request_id", "must be 1 to 64 visible ASCII characters"))
+    }
 }
 
 fn draw_seed() -> u64 {

@@ -33,8 +33,15 @@ use std::{
 };
 use uuid::Uuid;
 
+/// Longest name that a client may give a request.
+const REQUEST_ID_LEN_MAX: usize = 64;
 /// Resets of a session that are known by name.
 const RESET_IDS_MAX: usize = 16;
+
+/// Whether this is a name that a client may give a request: one that a log and a header can hold.
+pub fn is_request_id(id: &str) -> bool {
+    (1..=REQUEST_ID_LEN_MAX).contains(&id.len()) && id.bytes().all(|byte| byte.is_ascii_graphic())
+}
 
 /// What becomes of an act: the answer, shared by all who wait for it, or why there is none.
 pub type Outcome = Result<Arc<Answer>, ServiceError>;

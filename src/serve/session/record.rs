@@ -4,7 +4,7 @@
 //! takes its own version and the one before; what was damaged on its way is refused, never repaired. A checksum is no seal: whoever imports a
 //! record may have written it by hand, so that everything in it is checked against the model ([`Agent::adopt`]).
 
-use super::{Answer, Key, RESET_IDS_MAX, Session, Standing, Timings};
+use super::{Answer, Key, RESET_IDS_MAX, Session, Standing, Timings, is_request_id};
 use crate::{
     model::agent::{Agent, Chunk, Episode},
     serve::error::ServiceError,
@@ -128,7 +128,8 @@ impl Record {
         if last.as_ref().is_some_and(|last| !last.chunk.fits(agent.spec())) {
             return Err(misfit("last"));
         }
-        if reset_ids.len() > RESET_IDS_MAX {
+        // The empty one would be the name of every reset that has none.
+        if reset_ids.len() > RESET_IDS_MAX || !reset_ids.iter().all(|id| is_request_id(id)) {
             return Err(misfit("reset_ids"));
         }
         let episode = agent.adopt(episode).map_err(|error| ("episode".to_owned(), error.to_string()))?;
@@ -233,7 +234,9 @@ mod tests {
         assert_eq!(wrong(|record| record.step = 0), "step");
         assert_eq!(wrong(|record| record.last = None), "step");
         assert_eq!(wrong(|record| record.resets = u64::MAX), "step");
-        assert_eq!(wrong(|record| record.reset_ids = vec![String::new(); RESET_IDS_MAX + 1]), "reset_ids");
+        assert_eq!(wrong(|record| record.reset_ids = vec!["a".to_owned(); RESET_IDS_MAX + 1]), "reset_ids");
+        assert_eq!(wrong(|record| record.reset_ids = vec![String::new()]), "reset_ids");
+        assert_eq!(wrong(|record| record.reset_ids = vec!["a".repeat(65)]), "reset_ids");
         assert_eq!(wrong(|record| record.last.iter_mut().for_each(|last| last.chunk.actions[0].push(0.0))), "last");
         assert_eq!(wrong(|record| record.last.iter_mut().for_each(|last| last.chunk.latent_mean[0] = f32::NAN)), "last");
     }
