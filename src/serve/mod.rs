@@ -20,6 +20,7 @@ pub mod request;
 mod seat;
 pub mod service;
 pub mod session;
+pub mod store;
 pub mod telemetry;
 mod wire;
 

@@ -22,6 +22,16 @@ impl Handle {
         Uuid::try_parse(text).ok().map(Self)
     }
 
+    /// As bytes.
+    pub fn bytes(self) -> [u8; 16] {
+        self.0.into_bytes()
+    }
+
+    /// From bytes.
+    pub fn from_bytes(bytes: [u8; 16]) -> Self {
+        Self(Uuid::from_bytes(bytes))
+    }
+
     /// For spreading sessions evenly.
     pub(super) fn first_byte(self) -> u8 {
         self.0.as_bytes()[0]

@@ -1,0 +1,177 @@
+//! Where sessions outlive the process: each commit is written here before its answer goes out.
+//!
+//! A [`Home`] keeps the bytes of each session under its handle, and takes new ones only in the place of those which they go on from
+//! ([`Version`]), so that of two writers that race one is told to look again; nothing here supposes that there is one process. The [`Store`] gathers
+//! what arrives while its home is at work into one transaction, and brings each outcome home.
+
+mod embedded;
+mod writer;
+
+pub use embedded::{Durability, Embedded};
+pub use writer::{Outcome, Store};
+
+use crate::serve::session::Handle;
+use std::fmt;
+
+/// Where a session stands: what the next commit goes on from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Version {
+    /// Of the model, the first eight bytes of its digest.
+    pub model: u64,
+    /// How often the session was reset.
+    pub episode: u64,
+    /// Acts committed in that episode.
+    pub step: u64,
+}
+
+/// Bytes of a [`Version`].
+pub const VERSION_LEN: usize = 24;
+
+impl Version {
+    /// As bytes.
+    pub fn bytes(self) -> [u8; VERSION_LEN] {
+        let Self { model, episode, step } = self;
+        let mut bytes = [0; VERSION_LEN];
+        for (place, part) in bytes.as_chunks_mut().0.iter_mut().zip([model, episode, step]) {
+            *place = part.to_le_bytes();
+        }
+        bytes
+    }
+
+    /// From the beginning of what a home keeps.
+    pub fn of(bytes: &[u8]) -> Option<Self> {
+        let (parts, _) = bytes.get(..VERSION_LEN)?.as_chunks::<8>();
+        let [model, episode, step] = *parts else { return None };
+        let [model, episode, step] = [model, episode, step].map(u64::from_le_bytes);
+        Some(Self { model, episode, step })
+    }
+}
+
+/// How a session ended without its client.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// It was idle for too long.
+    Expired,
+    /// It gave its place to others.
+    Evicted,
+}
+
+/// What becomes of a session's place.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Change {
+    /// It holds these bytes, which begin with the version.
+    Keep {
+        /// What it goes on from: None where there is nothing yet.
+        from: Option<Version>,
+        /// The version, and the session behind it.
+        bytes: Vec<u8>,
+        /// The name of the request that opened it, where this opens it.
+        name: Option<Name>,
+    },
+    /// It is free, and the ending is remembered if there is one.
+    Free {
+        /// How it ended; None: its client has closed it.
+        ending: Option<(Ending, UnixMs)>,
+        /// The name of the request that opened it.
+        name: Option<Name>,
+    },
+}
+
+/// A name that a client gave a request, hashed.
+pub type Name = [u8; 16];
+
+/// Wall clock, in milliseconds since 1970.
+pub type UnixMs = u64;
+
+/// A change of one session's place.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Write {
+    /// Whose.
+    pub handle: Handle,
+    /// What.
+    pub change: Change,
+}
+
+/// What a home has of a session.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// Its bytes, which begin with its version.
+    Kept(Vec<u8>),
+    /// It has ended so.
+    Ended(Ending),
+    /// Nothing.
+    Empty,
+}
+
+/// Another writer was there: what is kept is not what the write goes on from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Conflict;
+
+/// Why nothing could be kept.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum StoreError {
+    /// There is no room. It may come back.
+    #[error("the store is full: {0}")]
+    Full(String),
+    /// It cannot be reached, or does not work. It may come back.
+    #[error("the store does not answer: {0}")]
+    Unavailable(String),
+}
+
+/// A place where bytes of sessions are kept. Calls block; they come from threads that may.
+pub trait Home: Send + Sync + 'static {
+    /// Makes all these changes that meet what they go on from, together or not at all; the answer of each. On an error none is made, or, where the home
+    /// was lost in the middle, all of them may be.
+    ///
+    /// # Errors
+    /// If nothing could be written.
+    fn write(&self, writes: &[Write]) -> Result<Vec<Result<(), Conflict>>, StoreError>;
+
+    /// What there is of a session.
+    ///
+    /// # Errors
+    /// If nothing could be read.
+    fn read(&self, handle: Handle) -> Result<Place, StoreError>;
+
+    /// The session that a request of this name has opened.
+    ///
+    /// # Errors
+    /// If nothing could be read.
+    fn named(&self, name: Name) -> Result<Option<Handle>, StoreError>;
+
+    /// Up to `len` sessions with handles above `after`, in order of handle.
+    ///
+    /// # Errors
+    /// If nothing could be read.
+    fn page(&self, after: Option<Handle>, len: usize) -> Result<Vec<(Handle, Vec<u8>)>, StoreError>;
+
+    /// Forgets endings that are older than this; says how many.
+    ///
+    /// # Errors
+    /// If nothing could be written.
+    fn forget_endings(&self, before: UnixMs) -> Result<usize, StoreError>;
+
+    /// Sessions, and the bytes that they and their upkeep take.
+    ///
+    /// # Errors
+    /// If nothing could be read.
+    fn size(&self) -> Result<Size, StoreError>;
+}
+
+/// How much a home holds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Size {
+    /// Sessions.
+    pub sessions: u64,
+    /// Bytes of the medium.
+    pub bytes: u64,
+}
+
+impl fmt::Display for Ending {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Ending::Expired => "expired",
+            Ending::Evicted => "evicted",
+        })
+    }
+}
