@@ -29,6 +29,9 @@ struct Flags {
     /// Directory of the checkpoints (models.dir).
     #[arg(long, value_name = "DIR")]
     models: Option<PathBuf>,
+    /// Directory where sessions are kept, so that they outlive the process (store.dir); without one they end with it.
+    #[arg(long, value_name = "DIR")]
+    store: Option<PathBuf>,
     /// Model of a client that names none (models.default).
     #[arg(long, value_name = "NAME")]
     default_model: Option<String>,
@@ -45,12 +48,13 @@ fn key_value(text: &str) -> Result<(String, String), String> {
 impl Flags {
     /// All settings, the named flags last.
     fn config(self) -> Result<Config, ConfigError> {
-        let Self { config, listen, models, default_model, mut settings } = self;
+        let Self { config, listen, models, store, default_model, mut settings } = self;
         let named = [("server.listen", listen), ("models.default", default_model)];
         settings.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
         let mut config = Config::load(config.as_deref(), &settings)?;
         // A path need not be text.
         config.models.dir = models.unwrap_or(config.models.dir);
+        config.store.dir = store.unwrap_or(config.store.dir);
         Ok(config)
     }
 }

@@ -1,7 +1,13 @@
 //! The one error of the service. Each face has its own table from it (`grpc/status.rs`, `http/problem.rs`); the words a client acts on stand here.
 
-use crate::model::agent::AgentError;
+use crate::{
+    model::agent::AgentError,
+    serve::store::{Ending, StoreError},
+};
 use uuid::Uuid;
+
+/// What a client is told to wait for a store that does not answer.
+const STORE_RETRY_AFTER_MS: u64 = 200;
 
 /// Why a request was not done; every variant leaves the session as it was, but for `Deadline`, after which somebody else may have it done.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -86,6 +92,21 @@ pub enum ServiceError {
     QueueFull {
         /// When to try again.
         retry_after_ms: u64,
+    },
+    /// What cannot be kept is not answered for: the same again once there is room.
+    #[error("the store is full: nothing was changed")]
+    StoreFull,
+    /// The same again, later: it gives the answer if it was kept after all.
+    #[error("the store does not answer")]
+    StoreUnavailable {
+        /// When to try again.
+        retry_after_ms: u64,
+    },
+    /// What is kept of this session is damaged; all others go on.
+    #[error("what was kept of the session is damaged ({id}): open a new one")]
+    StateCorrupt {
+        /// To find it in the log.
+        id: Uuid,
     },
     /// The same again, later, or close sessions.
     #[error("no room for another session")]
@@ -172,6 +193,29 @@ impl ServiceError {
         Self::Internal { id }
     }
 
+    /// A session that ended without its client.
+    pub fn ended(ending: Ending) -> Self {
+        match ending {
+            Ending::Expired => Self::SessionExpired,
+            Ending::Evicted => Self::SessionEvicted,
+        }
+    }
+
+    /// What the store said, in the words of the service.
+    pub fn from_store(error: &StoreError) -> Self {
+        match error {
+            StoreError::Full(_) => Self::StoreFull,
+            StoreError::Unavailable(_) => Self::StoreUnavailable { retry_after_ms: STORE_RETRY_AFTER_MS },
+        }
+    }
+
+    /// `cause` goes to the log, only its id to the client.
+    pub fn corrupt(cause: &dyn std::fmt::Display) -> Self {
+        let id = Uuid::new_v4();
+        tracing::error!(%id, %cause, "a stored session is damaged");
+        Self::StateCorrupt { id }
+    }
+
     /// What the model said, in the words of the service.
     pub fn from_agent(error: AgentError) -> Self {
         match error {
@@ -206,6 +250,9 @@ impl ServiceError {
             Self::TooLarge { .. } => "TOO_LARGE",
             Self::QueueFull { .. } => "QUEUE_FULL",
             Self::Quota { .. } => "QUOTA",
+            Self::StoreFull => "STORE_FULL",
+            Self::StoreUnavailable { .. } => "STORE_UNAVAILABLE",
+            Self::StateCorrupt { .. } => "STATE_CORRUPT",
             Self::Deadline { stage: Stage::Admission } => "DEADLINE_ADMISSION",
             Self::Deadline { stage: Stage::Queue } => "DEADLINE_QUEUE",
             Self::Deadline { stage: Stage::Compute } => "DEADLINE_COMPUTE",
@@ -243,6 +290,7 @@ impl ServiceError {
         match self {
             Self::QueueFull { retry_after_ms }
             | Self::Quota { retry_after_ms }
+            | Self::StoreUnavailable { retry_after_ms }
             | Self::Draining { retry_after_ms }
             | Self::NotReady { retry_after_ms } => Some(*retry_after_ms),
             _ => None,
@@ -252,7 +300,7 @@ impl ServiceError {
     /// To find an internal error in the log.
     pub fn error_id(&self) -> Option<Uuid> {
         match self {
-            Self::NonFiniteOutput { id } | Self::EnginePanic { id } | Self::Internal { id } => Some(*id),
+            Self::NonFiniteOutput { id } | Self::EnginePanic { id } | Self::Internal { id } | Self::StateCorrupt { id } => Some(*id),
             _ => None,
         }
     }
@@ -291,6 +339,9 @@ impl ServiceError {
             (Self::TooLarge { what: "bytes", limit: 1 }, 8, 413, "TOO_LARGE"),
             (Self::QueueFull { retry_after_ms }, 8, 429, "QUEUE_FULL"),
             (Self::Quota { retry_after_ms }, 8, 429, "QUOTA"),
+            (Self::StoreFull, 8, 507, "STORE_FULL"),
+            (Self::StoreUnavailable { retry_after_ms }, 14, 503, "STORE_UNAVAILABLE"),
+            (Self::StateCorrupt { id }, 15, 500, "STATE_CORRUPT"),
             (Self::Deadline { stage: Stage::Admission }, 4, 504, "DEADLINE_ADMISSION"),
             (Self::Deadline { stage: Stage::Queue }, 4, 504, "DEADLINE_QUEUE"),
             (Self::Deadline { stage: Stage::Compute }, 4, 504, "DEADLINE_COMPUTE"),

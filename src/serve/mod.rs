@@ -28,7 +28,7 @@ use config::Config;
 use guard::Guard;
 use listener::Faces;
 use registry::{Registry, RegistryError};
-use service::Service;
+use service::{Service, StartError};
 use std::{future::Future, io, net::SocketAddr, sync::Arc, time::Duration};
 use tokio::{
     net::{TcpListener, lookup_host},
@@ -51,9 +51,12 @@ pub enum ServerError {
         /// What the system said.
         reason: String,
     },
-    /// No threads for the engine.
-    #[error("engine: {0}")]
-    Engine(io::Error),
+    /// The models could not be loaded for a defect.
+    #[error("loading: {0}")]
+    Loading(io::Error),
+    /// No threads, or no place for sessions.
+    #[error(transparent)]
+    Start(#[from] StartError),
     /// The accept loop is gone.
     #[error("the accept loop ended: a defect of the server; see the log")]
     Accept,
@@ -98,7 +101,7 @@ impl Server {
     pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<(), ServerError> {
         let Self { listener, config } = self;
         let metrics = telemetry::install_metrics();
-        let service = Arc::new(Service::start(config.clone()).map_err(ServerError::Engine)?);
+        let service = Arc::new(Service::start(config.clone())?);
         let (grpc, health) = grpc::router(service.clone())?;
         grpc::report(&health, false).await;
         let guard = Guard::new(&config.server, listener.local_addr().ok());
@@ -149,7 +152,7 @@ async fn load(service: &Arc<Service>, config: Config) -> Result<(), ServerError>
     let warm = service.clone();
     let loading = move || Registry::load(&config.models).and_then(|registry| warm.warm_up(registry));
     let loaded = tokio::task::spawn_blocking(loading).await;
-    service.set_registry(loaded.map_err(|panic| ServerError::Engine(io::Error::other(panic)))??);
+    service.set_registry(loaded.map_err(|panic| ServerError::Loading(io::Error::other(panic)))??);
     Ok(())
 }
 

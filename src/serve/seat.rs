@@ -1,9 +1,13 @@
 //! The engine's ticket: it brings the outcome of an act home to its session.
 
-use crate::serve::{
-    engine::{Failure, Finished, Patience, Ticket},
-    error::{ServiceError, Stage},
-    session::{Answer, Flight, Session, Timings},
+use crate::{
+    model::agent::Episode,
+    serve::{
+        engine::{Failure, Finished, Patience, Ticket},
+        error::{ServiceError, Stage},
+        session::{Answer, Flight, Session, Timings},
+        store::{Conflict, Store},
+    },
 };
 use std::{sync::Arc, time::Instant};
 use uuid::Uuid;
@@ -15,6 +19,8 @@ pub(super) const RETRY_AFTER_RESTART_MS: u64 = 1_000;
 pub(super) struct Seat {
     pub session: Arc<Session>,
     pub flight: Arc<Flight>,
+    /// Where commits go first; None: they are in memory alone.
+    pub store: Option<Arc<Store>>,
     /// What its caller is told to wait if it has to leave a full queue.
     pub retry_after_ms: u64,
 }
@@ -33,15 +39,15 @@ impl Ticket for Seat {
     }
 
     fn settle(self, outcome: Result<Finished, Failure>) {
-        let Self { session, flight, retry_after_ms } = &self;
+        let Self { session, flight, store: _, retry_after_ms } = &self;
         match outcome {
             Ok(Finished { episode, chunk, queue, compute, at }) => {
                 let (now, evaluations) = (Instant::now(), chunk.evaluations.into());
                 metrics::counter!("ada_network_evaluations_total", "model" => session.model.to_string()).increment(evaluations);
                 let timings = Timings { queue, compute, commit: now - at, total: now - flight.arrived };
                 let (model, model_digest) = (session.model.clone(), session.agent.spec().digest.clone());
-                let answer = Answer { session: session.id, step: flight.step, chunk, timings, model, model_digest };
-                session.commit(flight, episode, answer);
+                let answer = Answer { session: session.id, step: flight.step, chunk: Arc::new(chunk), timings, model, model_digest };
+                self.commit(Arc::new(episode), Arc::new(answer));
             }
             Err(Failure::Agent(error)) => session.fail(flight, ServiceError::from_agent(error)),
             Err(Failure::Panic) => self.panicked("the model panicked over an act"),
@@ -53,6 +59,21 @@ impl Ticket for Seat {
 }
 
 impl Seat {
+    /// Commits before anybody is told: in memory, or, where there is a store, there first.
+    fn commit(self, episode: Arc<Episode>, answer: Arc<Answer>) {
+        let Some(store) = self.store.clone() else { return self.session.commit(&self.flight, episode, answer) };
+        match self.session.about_to_commit(&self.flight, &episode, &answer) {
+            Ok(Some(write)) => store.submit(write, move |outcome| match outcome {
+                Ok(Ok(())) => self.session.commit(&self.flight, episode, answer),
+                // Another server has gone on with the session.
+                Ok(Err(Conflict)) => self.session.fail(&self.flight, ServiceError::SessionNotFound),
+                Err(error) => self.session.fail(&self.flight, ServiceError::from_store(&error)),
+            }),
+            Ok(None) => self.session.fail(&self.flight, ServiceError::SessionNotFound),
+            Err(error) => self.session.fail(&self.flight, error),
+        }
+    }
+
     fn panicked(&self, what: &str) {
         let id = Uuid::new_v4();
         tracing::error!(%id, model = %self.session.model, step = self.flight.step, "{what}");

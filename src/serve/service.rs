@@ -11,7 +11,9 @@ use crate::{
         registry::{Model, Registry, RegistryError},
         request::{ActRequest, ActResult, Acted, ForkRequest, ImportRequest, ListRequest, OpenRequest, Opened, Page, ResetRequest},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
-        session::{Answer, Entry, Handle, Opening, Record, Session, Sessions, Standing, Summary, Untold, Waiter, is_request_id, key_of},
+        session::{
+            Answer, Entry, Handle, Keeper, KeeperError, Opening, Record, Session, Standing, Summary, Untold, Waiter, is_request_id, key_of,
+        },
         telemetry,
     },
 };
@@ -32,11 +34,22 @@ const DRAWN_SEED_BITS: u32 = 53;
 const PAGE_LEN: usize = 100;
 const PAGE_LEN_MAX: usize = 100;
 
+/// Why a service did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// No threads for the engine.
+    #[error("engine: {0}")]
+    Engine(std::io::Error),
+    /// No place for sessions.
+    #[error(transparent)]
+    Sessions(#[from] KeeperError),
+}
+
 /// The service: models, sessions and the engine between them.
 pub struct Service {
     config: Config,
     registry: OnceLock<Registry>,
-    sessions: Arc<Sessions>,
+    keeper: Keeper,
     engine: Engine<Seat>,
     draining: CancellationToken,
 }
@@ -45,14 +58,14 @@ impl Service {
     /// A service without models; see [`Service::set_registry`].
     ///
     /// # Errors
-    /// If the system gives no threads for the engine.
-    pub fn start(config: Config) -> std::io::Result<Self> {
+    /// If the system gives no threads for the engine, or the store cannot be opened.
+    pub fn start(config: Config) -> Result<Self, StartError> {
         let EngineConfig { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin_ms, wait_ms_max, .. } = config.engine;
         let [deadline_margin, wait_max] = [deadline_margin_ms, wait_ms_max].map(Duration::from_millis);
         let options = EngineOptions { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin, wait_max };
-        let engine = Engine::start(options)?;
-        let sessions = Arc::new(Sessions::new(config.sessions.clone()));
-        Ok(Self { config, registry: OnceLock::new(), sessions, engine, draining: CancellationToken::new() })
+        let keeper = Keeper::open_store(&config.sessions, &config.store)?;
+        let engine = Engine::start(options).map_err(StartError::Engine)?;
+        Ok(Self { config, registry: OnceLock::new(), keeper, engine, draining: CancellationToken::new() })
     }
 
     /// Runs each model in every batch length, so that its first act is as fast as any. Blocks for that time. Gives the models back that can
@@ -124,7 +137,7 @@ impl Service {
 
     /// House-keeping, to be called every `sessions.reap_interval_ms`.
     pub fn reap(&self) {
-        self.sessions.reap(Instant::now());
+        self.keeper.reap();
     }
 
     /// Brings the gauges up to date before they are read.
@@ -134,8 +147,9 @@ impl Service {
         metrics::gauge!("ada_queue_depth").set(waiting as f64);
         metrics::gauge!("ada_inflight_acts").set(running as f64);
         metrics::gauge!("ada_queue_wait_estimate_seconds").set(self.engine.expected_wait().as_secs_f64());
-        metrics::gauge!("ada_sessions").set(self.sessions.len() as f64);
-        metrics::gauge!("ada_session_state_bytes").set(self.sessions.bytes() as f64);
+        let table = self.keeper.table();
+        metrics::gauge!("ada_sessions").set(table.len() as f64);
+        metrics::gauge!("ada_session_state_bytes").set(table.bytes() as f64);
     }
 
     /// All models.
@@ -158,7 +172,7 @@ impl Service {
     ///
     /// # Errors
     /// `ModelNotFound`, `Invalid`, `TooLarge`, `Quota`, `NotReady`, `Draining`.
-    pub fn open(&self, request: OpenRequest) -> Result<Opened, ServiceError> {
+    pub async fn open(&self, request: OpenRequest) -> Result<Opened, ServiceError> {
         let OpenRequest { model, seed, options, ttl_ms, request_id, history } = request;
         check_request_id(&request_id)?;
         self.check_steps_told(history.len(), "number of steps of the history")?;
@@ -166,15 +180,15 @@ impl Service {
         let ttl = self.ttl(ttl_ms)?;
         let options = options.onto(&model.agent.spec().sampler);
         let episode = model.agent.recall(seed.unwrap_or_else(draw_seed), &options, &history).map_err(ServiceError::from_agent)?;
-        self.begin(model, (episode, Standing::default()), ttl, request_id)
+        self.begin(model, (Arc::new(episode), Standing::default()), ttl, request_id).await
     }
 
     /// ExportSession: what is committed at this moment, as bytes for [`Service::import`] here or elsewhere.
     ///
     /// # Errors
     /// `SessionNotFound` and its kin. It goes on while the server drains, as that is when a session may have to leave.
-    pub fn export(&self, session_id: &str) -> Result<Vec<u8>, ServiceError> {
-        let session = self.sessions.get(parse_id(session_id)?, Instant::now())?;
+    pub async fn export(&self, session_id: &str) -> Result<Vec<u8>, ServiceError> {
+        let session = self.session(session_id).await?;
         Record::of(&session)?.write().map_err(|error| ServiceError::internal(&error))
     }
 
@@ -182,7 +196,7 @@ impl Service {
     ///
     /// # Errors
     /// `Invalid` naming what is wrong with the record, `ModelGone`, and those of [`Service::open`].
-    pub fn import(&self, request: ImportRequest) -> Result<Opened, ServiceError> {
+    pub async fn import(&self, request: ImportRequest) -> Result<Opened, ServiceError> {
         let ImportRequest { record, ttl_ms, request_id } = request;
         let registry = self.registry()?;
         check_request_id(&request_id)?;
@@ -192,39 +206,38 @@ impl Service {
         let wrong = |(field, reason): (String, String)| ServiceError::invalid(format!("record.{field}"), reason);
         let (episode, standing) = record.standing(&model.agent).map_err(wrong)?;
         self.check_steps_told(episode.unread_len(), "number of steps that are yet to be read")?;
-        self.begin(model, (episode, standing), ttl, request_id)
+        self.begin(model, (episode, standing), ttl, request_id).await
     }
 
     /// ForkSession: another session that goes on from where this one stands.
     ///
     /// # Errors
     /// `SessionNotFound` and its kin, `EpisodeOver` and `StepOutOfOrder` where it stands elsewhere, and those of [`Service::open`].
-    pub fn fork(&self, request: ForkRequest) -> Result<Opened, ServiceError> {
+    pub async fn fork(&self, request: ForkRequest) -> Result<Opened, ServiceError> {
         let ForkRequest { session_id, seed, ttl_ms, request_id, step, episode } = request;
         let registry = self.registry()?;
         check_request_id(&request_id)?;
-        let session = self.session(&session_id)?;
+        let session = self.session(&session_id).await?;
         let ttl = ttl_ms.map_or(Ok(session.ttl()), |ttl_ms| self.ttl(Some(ttl_ms)))?;
         let (parent, standing) = session.standing((episode, step))?;
         let model = registry.pinned(&session.model, &session.agent.spec().digest)?.clone();
         let (own, forked) = (parent.seed(), (*parent).clone());
-        self.begin(model, (forked.with_seed(seed.unwrap_or(own)), standing), ttl, request_id)
+        self.begin(model, (Arc::new(forked.with_seed(seed.unwrap_or(own))), standing), ttl, request_id).await
     }
 
     /// A session that goes on from here.
-    fn begin(
+    async fn begin(
         &self,
         model: Model,
-        (episode, standing): (Episode, Standing),
+        (episode, standing): (Arc<Episode>, Standing),
         ttl: Duration,
         request_id: String,
     ) -> Result<Opened, ServiceError> {
         let is_named = !request_id.is_empty();
-        let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, standing, ttl, request_id };
-        let now = Instant::now();
-        let session = self.sessions.open(opening, now)?;
-        let untold = (!is_named).then(|| Untold::new(self.sessions.clone(), session.clone()));
-        Ok(Opened { session: session.summary(now), model, untold })
+        let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, standing, ttl, request_id, known: None };
+        let session = self.keeper.open(opening, self.registry()?).await?;
+        let untold = (!is_named).then(|| Untold::new(self.keeper.table().clone(), session.clone()));
+        Ok(Opened { session: session.summary(Instant::now()), model, untold })
     }
 
     /// Act.
@@ -233,9 +246,12 @@ impl Service {
     /// Every row of the error table; the session is as before, but see `Deadline`.
     pub async fn act(&self, request: ActRequest) -> Result<Acted, ServiceError> {
         let mut count = Count::new(request.caller);
-        let session = self.registry().and_then(|_| self.session(&request.session_id));
+        let session = match self.registry() {
+            Ok(_) => self.session(&request.session_id).await,
+            Err(error) => Err(error),
+        };
         if let Err(ServiceError::Draining { .. }) = &session
-            && let Some(acted) = self.committed(&request)
+            && let Some(acted) = self.committed(&request).await
         {
             return count.told(Ok(acted));
         }
@@ -284,57 +300,51 @@ impl Service {
     ///
     /// # Errors
     /// `SessionNotFound` and its kin, `SessionBusy`, `EpisodeOver`, `Invalid`, `Draining`.
-    pub fn reset(&self, request: ResetRequest) -> Result<Summary, ServiceError> {
+    pub async fn reset(&self, request: ResetRequest) -> Result<Summary, ServiceError> {
         let ResetRequest { session_id, seed, keep_history, request_id, episode } = request;
         self.registry()?;
         check_request_id(&request_id)?;
-        let session = self.session(&session_id)?;
-        let now = Instant::now();
+        let session = self.session(&session_id).await?;
         let renew = |episode: &Episode| {
             session.agent.reset(episode, seed.unwrap_or_else(draw_seed), keep_history).map_err(ServiceError::from_agent)
         };
-        session.reset(renew, episode, request_id, now)?;
-        Ok(session.summary(now))
+        self.keeper.reset(&session, renew, episode, request_id).await?;
+        Ok(session.summary(Instant::now()))
     }
 
     /// GetSession.
     ///
     /// # Errors
     /// `SessionNotFound` and its kin.
-    pub fn get(&self, session_id: &str) -> Result<Summary, ServiceError> {
-        Ok(self.session(session_id)?.summary(Instant::now()))
+    pub async fn get(&self, session_id: &str) -> Result<Summary, ServiceError> {
+        Ok(self.session(session_id).await?.summary(Instant::now()))
     }
 
     /// ListSessions.
     ///
     /// # Errors
     /// `Invalid` if the page token is none of ours.
-    pub fn list(&self, request: &ListRequest) -> Result<Page, ServiceError> {
+    pub async fn list(&self, request: &ListRequest) -> Result<Page, ServiceError> {
         let token = request.page_token.as_str();
         let not_ours = || ServiceError::invalid("page_token", "is not a token of a page before");
         let after = if token.is_empty() { None } else { Some(Handle::parse(token).ok_or_else(not_ours)?) };
         let model = (!request.model.is_empty()).then_some(request.model.as_str());
         let len = if request.page_size == 0 { PAGE_LEN } else { request.page_size.min(PAGE_LEN_MAX) };
-        let mut found = self.sessions.page(after, model, len + 1);
-        let more = found.len() > len;
-        found.truncate(len);
-        let last = found.last().filter(|_| more);
-        let next_page_token = last.map_or_else(String::new, |session| session.handle.to_string());
-        let now = Instant::now();
-        Ok(Page { sessions: found.iter().map(|session| session.listed(request.in_full, now)).collect(), next_page_token })
+        let (sessions, next) = self.keeper.page(after, model, (len, request.in_full)).await?;
+        Ok(Page { sessions, next_page_token: next.map_or_else(String::new, |handle| handle.to_string()) })
     }
 
     /// CloseSession.
     ///
     /// # Errors
     /// `SessionNotFound` and its kin.
-    pub fn close(&self, session_id: &str) -> Result<(), ServiceError> {
-        self.sessions.close(parse_id(session_id)?, Instant::now())
+    pub async fn close(&self, session_id: &str) -> Result<(), ServiceError> {
+        self.keeper.close(parse_id(session_id)?, self.loaded()?).await
     }
 
     /// While draining, the answer of a step that is committed already: whoever lost it is not to lose the act.
-    fn committed(&self, request: &ActRequest) -> Option<Acted> {
-        let session = self.session(&request.session_id).ok()?;
+    async fn committed(&self, request: &ActRequest) -> Option<Acted> {
+        let session = self.session(&request.session_id).await.ok()?;
         let answer = session.replay((request.episode, request.step), key_of(&request.observation))?;
         metrics::counter!("ada_replays_total", "source" => "memory").increment(1);
         Some(Acted { answer, replayed: true, want_planned_states: request.want_planned_states })
@@ -377,7 +387,8 @@ impl Service {
                 // Whoever is patient, or names no deadline, has a turn after a while all the same, before those who are in a hurry and came later.
                 let turn_by = arrived + patience.min(Duration::from_millis(self.config.engine.turn_ms_max));
                 let retry_after_ms = self.config.engine.retry_after_ms;
-                let seat = Seat { session: session.clone(), flight: waiter.flight().clone(), retry_after_ms };
+                let (flight, store) = (waiter.flight().clone(), self.keeper.store());
+                let seat = Seat { session: session.clone(), flight, store, retry_after_ms };
                 self.submit(seat, Question { episode, observation }, turn_by, caller.client);
                 (waiter, false)
             }
@@ -426,8 +437,13 @@ impl Service {
         self.registry.get().ok_or(ServiceError::NotReady { retry_after_ms })
     }
 
-    fn session(&self, session_id: &str) -> Result<Arc<Session>, ServiceError> {
-        self.sessions.get(parse_id(session_id)?, Instant::now())
+    async fn session(&self, session_id: &str) -> Result<Arc<Session>, ServiceError> {
+        self.keeper.find(parse_id(session_id)?, self.loaded()?).await
+    }
+
+    /// The models, while draining too.
+    fn loaded(&self) -> Result<&Registry, ServiceError> {
+        self.registry.get().ok_or(ServiceError::NotReady { retry_after_ms: RETRY_AFTER_RESTART_MS })
     }
 
     fn ttl(&self, ttl_ms: Option<u64>) -> Result<Duration, ServiceError> {

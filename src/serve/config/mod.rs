@@ -6,7 +6,7 @@ mod tests;
 
 pub use layers::Origin;
 
-use crate::model::nn::Precision;
+use crate::{model::nn::Precision, serve::store::Durability};
 use layers::Layers;
 use serde::{Deserialize, Serialize};
 use std::{env, ffi::OsString, net::Ipv6Addr, path::Path, path::PathBuf, thread};
@@ -23,6 +23,8 @@ pub struct Config {
     pub limits: LimitsConfig,
     /// The session table.
     pub sessions: SessionsConfig,
+    /// Where sessions outlive the process.
+    pub store: StoreConfig,
     /// The threads that run the networks.
     pub engine: EngineConfig,
     /// The checkpoints.
@@ -128,6 +130,26 @@ pub struct SessionsConfig {
     pub tombstones_max: usize,
     /// How often the table is searched for expired sessions.
     pub reap_interval_ms: u64,
+}
+
+/// Where sessions outlive the process.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StoreConfig {
+    /// Directory of the embedded store; empty: sessions are in memory alone, and end with the process.
+    pub dir: PathBuf,
+    /// What a commit survives: the end of the `process`, or that of the `power`.
+    pub durability: Durability,
+    /// Sessions that are kept, those in memory among them; one more is refused (STORE_FULL).
+    pub len_max: u64,
+    /// Bytes of its file; beyond it no session is opened (STORE_FULL), and those that are there go on.
+    pub bytes_max: u64,
+    /// Memory for its pages.
+    pub cache_bytes: usize,
+    /// Commits that wait for it; one more is refused (STORE_UNAVAILABLE).
+    pub queue_len_max: usize,
+    /// Sessions that are looked at for their end each `sessions.reap_interval_ms`.
+    pub sweep_len: usize,
 }
 
 /// The threads that run the networks.
@@ -253,6 +275,20 @@ impl Default for SessionsConfig {
             tombstone_ttl_ms: 600_000,
             tombstones_max: 100_000,
             reap_interval_ms: 1_000,
+        }
+    }
+}
+
+impl Default for StoreConfig {
+    fn default() -> Self {
+        Self {
+            dir: PathBuf::new(),
+            durability: Durability::Process,
+            len_max: 1_000_000,
+            bytes_max: 16 << 30,
+            cache_bytes: 64 << 20,
+            queue_len_max: 4096,
+            sweep_len: 2_000,
         }
     }
 }

@@ -206,7 +206,7 @@ pub fn act_response(acted: &Acted) -> pb::ActResponse {
         value_spread,
         start,
         degraded,
-    } = chunk;
+    } = &**chunk;
     let (start, renoised_rungs) = self::start(*start);
     pb::ActResponse {
         session_id: session.to_string(),

@@ -132,21 +132,21 @@ impl agent_server::Agent for Face {
 
     async fn open_session(&self, request: Request<pb::OpenSessionRequest>) -> Answer<pb::OpenSessionResponse> {
         let request = convert::open_request(request.into_inner()).map_err(refuse)?;
-        opened(self.0.open(request))
+        opened(self.0.open(request).await)
     }
 
     async fn export_session(&self, request: Request<pb::ExportSessionRequest>) -> Answer<pb::ExportSessionResponse> {
         let pb::ExportSessionRequest { session_id } = request.into_inner();
-        let record = self.0.export(&session_id).map_err(refuse)?;
+        let record = self.0.export(&session_id).await.map_err(refuse)?;
         Ok(Response::new(pb::ExportSessionResponse { record }))
     }
 
     async fn import_session(&self, request: Request<pb::ImportSessionRequest>) -> Answer<pb::OpenSessionResponse> {
-        opened(self.0.import(convert::import_request(request.into_inner())))
+        opened(self.0.import(convert::import_request(request.into_inner())).await)
     }
 
     async fn fork_session(&self, request: Request<pb::ForkSessionRequest>) -> Answer<pb::OpenSessionResponse> {
-        opened(self.0.fork(convert::fork_request(request.into_inner())))
+        opened(self.0.fork(convert::fork_request(request.into_inner())).await)
     }
 
     async fn act(&self, request: Request<pb::ActRequest>) -> Answer<pb::ActResponse> {
@@ -182,25 +182,25 @@ impl agent_server::Agent for Face {
     }
 
     async fn reset_session(&self, request: Request<pb::ResetSessionRequest>) -> Answer<pb::ResetSessionResponse> {
-        let session = self.0.reset(convert::reset_request(request.into_inner())).map_err(refuse)?;
+        let session = self.0.reset(convert::reset_request(request.into_inner())).await.map_err(refuse)?;
         Ok(Response::new(pb::ResetSessionResponse { session: Some(convert::session(session)) }))
     }
 
     async fn get_session(&self, request: Request<pb::GetSessionRequest>) -> Answer<pb::GetSessionResponse> {
         let pb::GetSessionRequest { session_id } = request.into_inner();
-        let session = self.0.get(&session_id).map_err(refuse)?;
+        let session = self.0.get(&session_id).await.map_err(refuse)?;
         Ok(Response::new(pb::GetSessionResponse { session: Some(convert::session(session)) }))
     }
 
     async fn list_sessions(&self, request: Request<pb::ListSessionsRequest>) -> Answer<pb::ListSessionsResponse> {
-        let page = self.0.list(&convert::list_request(request.into_inner()).map_err(refuse)?).map_err(refuse)?;
+        let page = self.0.list(&convert::list_request(request.into_inner()).map_err(refuse)?).await.map_err(refuse)?;
         let sessions = page.sessions.into_iter().map(convert::session).collect();
         Ok(Response::new(pb::ListSessionsResponse { sessions, next_page_token: page.next_page_token }))
     }
 
     async fn close_session(&self, request: Request<pb::CloseSessionRequest>) -> Answer<pb::CloseSessionResponse> {
         let pb::CloseSessionRequest { session_id } = request.into_inner();
-        self.0.close(&session_id).map_err(refuse)?;
+        self.0.close(&session_id).await.map_err(refuse)?;
         Ok(Response::new(pb::CloseSessionResponse {}))
     }
 }

@@ -17,9 +17,12 @@ pub fn code(error: &ServiceError) -> Code {
         | ServiceError::SessionEvicted
         | ServiceError::ModelNotFound { .. }
         | ServiceError::ModelGone { .. } => Code::NotFound,
-        ServiceError::TooLarge { .. } | ServiceError::QueueFull { .. } | ServiceError::Quota { .. } => Code::ResourceExhausted,
+        ServiceError::TooLarge { .. } | ServiceError::QueueFull { .. } | ServiceError::Quota { .. } | ServiceError::StoreFull => {
+            Code::ResourceExhausted
+        }
+        ServiceError::StateCorrupt { .. } => Code::DataLoss,
         ServiceError::Deadline { .. } => Code::DeadlineExceeded,
-        ServiceError::Draining { .. } | ServiceError::NotReady { .. } => Code::Unavailable,
+        ServiceError::Draining { .. } | ServiceError::NotReady { .. } | ServiceError::StoreUnavailable { .. } => Code::Unavailable,
         ServiceError::NonFiniteOutput { .. } | ServiceError::EnginePanic { .. } | ServiceError::Internal { .. } => Code::Internal,
     }
 }
@@ -56,7 +59,7 @@ mod tests {
             assert_eq!(trailer("ada-committed-step"), error.committed_step().map(|_| "3".to_owned()), "{error:?}");
             assert_eq!(trailer("ada-episode"), error.episode().map(|_| "2".to_owned()), "{error:?}");
             assert_eq!(trailer("grpc-retry-pushback-ms"), error.retry_after_ms().map(|_| "1500".to_owned()), "{error:?}");
-            assert_eq!(trailer("ada-error-id").is_some(), grpc == 13, "{error:?}");
+            assert_eq!(trailer("ada-error-id").is_some(), [13, 15].contains(&grpc), "{error:?}");
         }
     }
 }

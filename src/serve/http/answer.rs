@@ -92,7 +92,7 @@ impl From<&Acted> for ActAnswer {
             value_spread,
             start,
             degraded,
-        } = chunk.clone();
+        } = (**chunk).clone();
         let (start, renoised_rungs) = match start {
             Start::Cold => ("cold", 0),
             Start::Warm => ("warm", 0),

@@ -55,10 +55,14 @@ pub fn status(error: &ServiceError) -> StatusCode {
         ServiceError::TooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
         ServiceError::QueueFull { .. } | ServiceError::Quota { .. } => StatusCode::TOO_MANY_REQUESTS,
         ServiceError::Deadline { .. } => StatusCode::GATEWAY_TIMEOUT,
-        ServiceError::Draining { .. } | ServiceError::NotReady { .. } => StatusCode::SERVICE_UNAVAILABLE,
-        ServiceError::NonFiniteOutput { .. } | ServiceError::EnginePanic { .. } | ServiceError::Internal { .. } => {
-            StatusCode::INTERNAL_SERVER_ERROR
+        ServiceError::StoreFull => StatusCode::INSUFFICIENT_STORAGE,
+        ServiceError::Draining { .. } | ServiceError::NotReady { .. } | ServiceError::StoreUnavailable { .. } => {
+            StatusCode::SERVICE_UNAVAILABLE
         }
+        ServiceError::NonFiniteOutput { .. }
+        | ServiceError::EnginePanic { .. }
+        | ServiceError::Internal { .. }
+        | ServiceError::StateCorrupt { .. } => StatusCode::INTERNAL_SERVER_ERROR,
     }
 }
 

@@ -144,7 +144,7 @@ async fn read_if_any<T: DeserializeOwned + Default>(body: Body, state: &State) -
 #[utoipa::path(post, path = "/v1/sessions", request_body = OpenBody, responses((status = 201, description = "The session and its model", body = OpenAnswer), Problem))]
 async fn open_session(Shared(state): Shared<State>, body: Body) -> Result<Response, Problem> {
     let request: OpenBody = read(body, &state).await?;
-    Ok(opened(state.service.open(request.into())?))
+    Ok(opened(state.service.open(request.into()).await?))
 }
 
 fn opened(Opened { session, model, untold }: Opened) -> Response {
@@ -156,14 +156,14 @@ fn opened(Opened { session, model, untold }: Opened) -> Response {
 #[utoipa::path(get, path = "/v1/sessions/{id}/export", params(("id" = String, Path)),
     responses((status = 200, description = "The session as bytes; a body for ImportSession as it is", body = ExportAnswer), Problem))]
 async fn export_session(Shared(state): Shared<State>, Named(id): Named) -> Answer<ExportAnswer> {
-    Ok(Json(ExportAnswer::of(&state.service.export(&id)?)))
+    Ok(Json(ExportAnswer::of(&state.service.export(&id).await?)))
 }
 
 /// ImportSession
 #[utoipa::path(post, path = "/v1/sessions:import", request_body = ImportBody, responses((status = 201, description = "The session, and its model", body = OpenAnswer), Problem))]
 async fn import_session(Shared(state): Shared<State>, body: Body) -> Result<Response, Problem> {
     let request: ImportBody = read(body, &state).await?;
-    Ok(opened(state.service.import(request.try_into()?)?))
+    Ok(opened(state.service.import(request.try_into()?).await?))
 }
 
 /// ForkSession
@@ -171,7 +171,7 @@ async fn import_session(Shared(state): Shared<State>, body: Body) -> Result<Resp
     responses((status = 201, description = "The new session, and its model", body = OpenAnswer), Problem))]
 async fn fork_session(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Result<Response, Problem> {
     let body: ForkBody = read_if_any(body, &state).await?;
-    Ok(opened(state.service.fork(body.into_request(id))?))
+    Ok(opened(state.service.fork(body.into_request(id)).await?))
 }
 
 /// ListSessions
@@ -179,7 +179,7 @@ async fn fork_session(Shared(state): Shared<State>, Named(id): Named, body: Body
 async fn list_sessions(Shared(state): Shared<State>, query: Result<Query<ListQuery>, QueryRejection>) -> Answer<ManySessions> {
     let Query(query) = query.map_err(|error| misread_query(&error))?;
     let ListQuery { page_size, page_token, model, view } = query;
-    let page = state.service.list(&ListRequest { page_size, page_token, model, in_full: view == View::Full })?;
+    let page = state.service.list(&ListRequest { page_size, page_token, model, in_full: view == View::Full }).await?;
     let sessions = page.sessions.into_iter().map(Into::into).collect();
     Ok(Json(ManySessions { sessions, next_page_token: page.next_page_token }))
 }
@@ -187,13 +187,13 @@ async fn list_sessions(Shared(state): Shared<State>, query: Result<Query<ListQue
 /// GetSession
 #[utoipa::path(get, path = "/v1/sessions/{id}", params(("id" = String, Path)), responses((status = 200, description = "The session", body = OneSession), Problem))]
 async fn get_session(Shared(state): Shared<State>, Named(id): Named) -> Answer<OneSession> {
-    Ok(Json(OneSession { session: state.service.get(&id)?.into() }))
+    Ok(Json(OneSession { session: state.service.get(&id).await?.into() }))
 }
 
 /// CloseSession
 #[utoipa::path(delete, path = "/v1/sessions/{id}", params(("id" = String, Path)), responses((status = 204, description = "It is closed"), Problem))]
 async fn close_session(Shared(state): Shared<State>, Named(id): Named) -> Result<StatusCode, Problem> {
-    state.service.close(&id)?;
+    state.service.close(&id).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
@@ -202,7 +202,7 @@ async fn close_session(Shared(state): Shared<State>, Named(id): Named) -> Result
     responses((status = 200, description = "The session", body = OneSession), Problem))]
 async fn reset_session(Shared(state): Shared<State>, Named(id): Named, body: Body) -> Answer<OneSession> {
     let body: ResetBody = read_if_any(body, &state).await?;
-    let session = state.service.reset(body.into_request(id))?;
+    let session = state.service.reset(body.into_request(id)).await?;
     Ok(Json(OneSession { session: session.into() }))
 }
 
@@ -227,7 +227,7 @@ async fn act_stream(
 ) -> Result<Response, Problem> {
     let upgrade = upgrade.map_err(|error| ServiceError::invalid("headers", error.body_text()))?;
     state.service.accepts()?;
-    state.service.get(&id)?;
+    state.service.get(&id).await?;
     let limit = state.service.config().limits.message_bytes_max;
     // The stock buffer is allocated at once, 128 KiB for each socket, whether or not it ever says a word.
     let upgrade = upgrade.max_message_size(limit).max_frame_size(limit).read_buffer_size(READ_BUFFER_LEN);

@@ -26,6 +26,8 @@ pub struct Flight {
     /// Nobody can join once this is 0: the flight is over.
     waiters: AtomicUsize,
     computing: AtomicBool,
+    /// The act is done and on its way into the store: from now on it is committed or refused, whoever waits.
+    storing: AtomicBool,
     /// Of each of those who wait, by number.
     patience: Mutex<Vec<(u64, Patience)>>,
     outcome: watch::Sender<Option<Outcome>>,
@@ -35,14 +37,29 @@ pub struct Flight {
 
 impl Flight {
     pub(super) fn new(step: u64, key: Key, arrived: Instant, patience: Patience) -> Arc<Self> {
-        let (waiters, computing, outcome) = (AtomicUsize::new(1), AtomicBool::new(false), watch::Sender::new(None));
+        let (waiters, outcome) = (AtomicUsize::new(1), watch::Sender::new(None));
+        let [computing, storing] = [AtomicBool::new(false), AtomicBool::new(false)];
         let patience = Mutex::new(vec![(0, patience)]);
-        Arc::new(Self { step, key, arrived, waiters, computing, patience, outcome, leave: Mutex::new(None) })
+        Arc::new(Self { step, key, arrived, waiters, computing, storing, patience, outcome, leave: Mutex::new(None) })
     }
 
     /// Whether somebody waits and there is no outcome yet.
     pub fn is_wanted(&self) -> bool {
         self.waiters.load(Ordering::Acquire) > 0 && self.outcome.borrow().is_none()
+    }
+
+    /// Whether the session cannot do anything else meanwhile.
+    pub fn is_busy(&self) -> bool {
+        self.is_wanted() || self.is_storing() && self.outcome.borrow().is_none()
+    }
+
+    fn is_storing(&self) -> bool {
+        self.storing.load(Ordering::Acquire)
+    }
+
+    /// Called by whoever holds the session's slot.
+    pub(super) fn begin_storing(&self) {
+        self.storing.store(true, Ordering::Release);
     }
 
     /// It waits for a worker; `leave` is called once nobody wants it any more.
@@ -116,7 +133,7 @@ impl Waiter {
 
     /// None if the last one has left already.
     pub(super) fn join(session: &Arc<Session>, flight: &Arc<Flight>, patience: Patience) -> Option<Self> {
-        let one_more = |waiters| (waiters > 0).then_some(waiters + 1);
+        let one_more = |waiters| (waiters > 0 || flight.is_storing()).then_some(waiters + 1);
         flight.waiters.fetch_update(Ordering::AcqRel, Ordering::Acquire, one_more).ok()?;
         let number = flight.wait_for(patience);
         Some(Self { session: session.clone(), flight: flight.clone(), number })
@@ -147,8 +164,13 @@ impl Drop for Waiter {
     fn drop(&mut self) {
         self.flight.patience.lock().retain(|(number, _)| *number != self.number);
         if self.flight.waiters.fetch_sub(1, Ordering::AcqRel) == 1 && self.flight.outcome.borrow().is_none() {
+            let mut slot = self.session.slot.lock();
+            if self.flight.is_storing() {
+                return;
+            }
+            slot.release(&self.flight);
+            drop(slot);
             metrics::counter!("ada_cancelled_total", "stage" => self.flight.stage().word()).increment(1);
-            self.session.slot.lock().release(&self.flight);
             self.flight.leave();
         }
     }
@@ -174,8 +196,16 @@ mod tests {
         let episode = agent.open(1, &options).unwrap();
         let seen = Observation { state: vec![0.1; 4], ..Observation::default() };
         let (after, chunk) = agent.act(&episode, &seen).unwrap();
-        let opening = Opening { model: "tiny".into(), agent, episode: episode.clone(), standing: Standing::default(), ttl, request_id };
-        let session = Sessions::new(SessionsConfig::default()).open(opening, Instant::now()).unwrap();
+        let opening = Opening {
+            model: "tiny".into(),
+            agent,
+            episode: Arc::new(episode.clone()),
+            standing: Standing::default(),
+            ttl,
+            request_id,
+            known: None,
+        };
+        let session = Sessions::new(SessionsConfig::default(), None).open(opening, Instant::now()).unwrap();
         let (mut told, mut silent) = (0, 0);
         for turn in 0..4_000 {
             let Ok(Entry::Lead(waiter, _)) = session.enter((None, 1), key_of(&seen), Instant::now(), Patience::default()) else {
@@ -183,7 +213,8 @@ mod tests {
             };
             let (flight, together) = (waiter.flight().clone(), AtomicUsize::new(0));
             let (model, model_digest) = (session.model.clone(), String::new());
-            let answer = Answer { session: session.id, step: 1, chunk: chunk.clone(), timings: Timings::default(), model, model_digest };
+            let answer =
+                Answer { session: session.id, step: 1, chunk: Arc::new(chunk.clone()), timings: Timings::default(), model, model_digest };
             // Both begin within a moment that wanders over the commit; on a busy machine whoever arrives last is far ahead.
             let meet = |pauses: usize| {
                 together.fetch_add(1, Ordering::AcqRel);
@@ -196,14 +227,15 @@ mod tests {
                 threads.spawn(|| {
                     let after = after.clone();
                     meet(turn % 8 * 2_000);
-                    session.commit(&flight, after, answer);
+                    session.commit(&flight, Arc::new(after), Arc::new(answer));
                 });
                 meet(turn % 100);
                 waiter.give_up()
             });
             assert_eq!(late.is_some(), session.summary(Instant::now()).committed_step == 1);
             *if late.is_some() { &mut told } else { &mut silent } += 1;
-            session.reset(|_| Ok(episode.clone()), None, String::new(), Instant::now()).unwrap();
+            let reset = session.begin_reset(|_| Ok(episode.clone()), None, String::new(), Instant::now()).unwrap();
+            session.finish_reset(reset);
         }
         assert!(told > 0 && silent > 0, "both orders occur: {told}, {silent}");
     }

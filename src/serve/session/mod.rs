@@ -2,6 +2,8 @@
 
 mod flight;
 mod handle;
+mod keeper;
+mod keeping;
 mod key;
 mod record;
 mod table;
@@ -9,8 +11,10 @@ mod untold;
 
 pub use flight::{Flight, Waiter};
 pub use handle::Handle;
+pub use keeper::{Keeper, KeeperError};
+pub use keeping::name_of;
 pub use key::{Key, key_of};
-pub use record::{Last, Record, Unreadable};
+pub use record::{Kept, Last, Record, Unreadable};
 pub use table::Sessions;
 pub use untold::Untold;
 
@@ -19,7 +23,11 @@ use crate::{
         agent::{Agent, Chunk, Episode},
         options::SamplerOptions,
     },
-    serve::{engine::Patience, error::ServiceError},
+    serve::{
+        engine::Patience,
+        error::ServiceError,
+        store::{UnixMs, Version, unix_ms},
+    },
 };
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
@@ -54,7 +62,7 @@ pub struct Answer {
     /// The step it committed.
     pub step: u64,
     /// What the model said.
-    pub chunk: Chunk,
+    pub chunk: Arc<Chunk>,
     /// Where the time went.
     pub timings: Timings,
     /// Name of the model.
@@ -84,13 +92,15 @@ pub struct Opening {
     /// The model.
     pub agent: Arc<Agent>,
     /// The episode that it goes on with.
-    pub episode: Episode,
+    pub episode: Arc<Episode>,
     /// Where it stands.
     pub standing: Standing,
     /// Idle time to live.
     pub ttl: Duration,
     /// The client's name for the request; empty: none.
     pub request_id: String,
+    /// Its id and when it was opened, of one that comes back from the store; None: a new one.
+    pub known: Option<(Uuid, UnixMs)>,
 }
 
 /// Where a session stands in its episodes. The default one is new.
@@ -104,6 +114,13 @@ pub struct Standing {
     pub reset_ids: Vec<String>,
     /// The answer of the last act.
     pub last: Option<Last>,
+}
+
+/// A new episode that is about to begin.
+pub struct Reset {
+    from: Version,
+    episode: Arc<Episode>,
+    standing: Standing,
 }
 
 /// One session. Its slot is locked for moments only, never while a model runs or across an await.
@@ -121,7 +138,7 @@ pub struct Session {
     /// Name of the request that opened it; empty: none.
     request_id: String,
     ttl: Duration,
-    opened: Instant,
+    opened: UnixMs,
     /// Memory of all sessions of the table, kept up to date by each.
     bytes_total: Arc<AtomicUsize>,
     slot: Mutex<Slot>,
@@ -137,6 +154,8 @@ struct Slot {
     reset_ids: VecDeque<String>,
     committed: Committed,
     flight: Option<Arc<Flight>>,
+    /// A new episode is on its way into the store.
+    resetting: bool,
     ended: bool,
 }
 
@@ -145,12 +164,6 @@ struct Committed {
     step: u64,
     episode: Arc<Episode>,
     last: Option<(Key, Arc<Answer>)>,
-}
-
-impl Committed {
-    fn fresh(episode: Episode) -> Self {
-        Self { step: 0, episode: Arc::new(episode), last: None }
-    }
 }
 
 /// How a step stands to the session.
@@ -205,18 +218,27 @@ pub struct Detail {
 
 impl Session {
     fn new(opening: Opening, bytes_total: Arc<AtomicUsize>, now: Instant) -> Self {
-        let Opening { model, agent, episode, standing, ttl, request_id } = opening;
+        let Opening { model, agent, episode, standing, ttl, request_id, known } = opening;
         let Standing { step, resets, reset_ids, last } = standing;
         let options = episode.options().clone();
         bytes_total.fetch_add(episode.size_bytes(), Ordering::Relaxed);
-        let id = Uuid::new_v4();
+        let (id, opened) = known.unwrap_or_else(|| (Uuid::new_v4(), unix_ms()));
         let answer = |Last { key, chunk, timings }| {
             let (model, model_digest) = (model.clone(), agent.spec().digest.clone());
             (key, Arc::new(Answer { session: id, step, chunk, timings, model, model_digest }))
         };
-        let committed = Committed { step, episode: Arc::new(episode), last: last.map(answer) };
-        let slot = Slot { touched: now, used: false, resets, reset_ids: reset_ids.into(), committed, flight: None, ended: false };
-        Self { id, handle: Handle::of(id), model, agent, options, request_id, ttl, opened: now, bytes_total, slot: Mutex::new(slot) }
+        let committed = Committed { step, episode, last: last.map(answer) };
+        let slot = Slot {
+            touched: now,
+            used: false,
+            resets,
+            reset_ids: reset_ids.into(),
+            committed,
+            flight: None,
+            resetting: false,
+            ended: false,
+        };
+        Self { id, handle: Handle::of(id), model, agent, options, request_id, ttl, opened, bytes_total, slot: Mutex::new(slot) }
     }
 
     /// Takes up a step, of this episode if one is named: replays, joins or leads it, for a caller who has this patience.
@@ -237,6 +259,9 @@ impl Session {
         slot.touched = now;
         slot.check_episode(episode)?;
         let committed = slot.committed.step;
+        if slot.resetting {
+            return Err(ServiceError::SessionBusy { committed });
+        }
         if step == committed
             && let Some((last_key, answer)) = &slot.committed.last
         {
@@ -244,11 +269,11 @@ impl Session {
             return if same { Ok(Entry::Replay(answer.clone())) } else { Err(ServiceError::StepPayloadMismatch { step, committed }) };
         }
         if step != committed + 1 {
-            let busy = slot.flight.as_ref().is_some_and(|flight| flight.is_wanted());
+            let busy = slot.flight.as_ref().is_some_and(|flight| flight.is_busy());
             return Err(if busy { ServiceError::SessionBusy { committed } } else { ServiceError::StepOutOfOrder { step, committed } });
         }
         // The keys are compared before anyone joins: a waiter that was dropped here would lock the slot once more, from this thread.
-        if let Some(flight) = slot.flight.as_ref().filter(|flight| flight.is_wanted()) {
+        if let Some(flight) = slot.flight.as_ref().filter(|flight| flight.is_busy()) {
             if flight.key != key {
                 return Err(ServiceError::StepPayloadMismatch { step, committed });
             }
@@ -270,13 +295,12 @@ impl Session {
     }
 
     /// Commits the episode and the answer together, if the flight is still the session's; a flight that was dropped meanwhile changes nothing.
-    pub fn commit(&self, flight: &Arc<Flight>, episode: Episode, answer: Answer) {
-        let answer = Arc::new(answer);
+    pub fn commit(&self, flight: &Arc<Flight>, episode: Arc<Episode>, answer: Arc<Answer>) {
         {
             let mut slot = self.slot.lock();
             let outcome = if slot.release(flight) && slot.committed.step + 1 == flight.step {
                 self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
-                slot.committed = Committed { step: flight.step, episode: Arc::new(episode), last: Some((flight.key, answer.clone())) };
+                slot.committed = Committed { step: flight.step, episode, last: Some((flight.key, answer.clone())) };
                 slot.touched = Instant::now();
                 Ok(answer)
             } else {
@@ -294,38 +318,52 @@ impl Session {
         flight.settle(Err(error));
     }
 
-    /// A new episode, made from the old one, which is this one if one is named. A named request that has reset the session already does not
-    /// do so again: a copy that came late once undid 24 committed acts.
+    /// Begins a new episode, made from the old one, which is this one if one is named; until it is finished nothing else happens to the session. None: a named
+    /// request that has reset the session already does not do so again: a copy that came late once undid 24 committed acts.
     ///
     /// # Errors
     /// If the episode is over, while an act is in flight, or after the end; and those of `renew`.
-    pub fn reset(
+    pub fn begin_reset(
         &self,
         renew: impl FnOnce(&Episode) -> Result<Episode, ServiceError>,
         ends: Option<u64>,
         request_id: String,
         now: Instant,
-    ) -> Result<(), ServiceError> {
+    ) -> Result<Option<Reset>, ServiceError> {
         let mut slot = self.slot.lock();
         if slot.ended {
             return Err(ServiceError::SessionNotFound);
         }
         if slot.reset_ids.contains(&request_id) {
             slot.touched = now;
-            return Ok(());
+            return Ok(None);
         }
         slot.check_episode(ends)?;
-        if slot.flight.as_ref().is_some_and(|flight| flight.is_wanted()) {
+        if slot.resetting || slot.flight.as_ref().is_some_and(|flight| flight.is_busy()) {
             return Err(ServiceError::SessionBusy { committed: slot.committed.step });
         }
-        let episode = renew(&slot.committed.episode)?;
-        self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
+        let episode = Arc::new(renew(&slot.committed.episode)?);
+        let from = self.version(&slot);
+        slot.resetting = true;
         slot.flight = None;
-        slot.resets += 1;
-        slot.remember(request_id);
-        slot.touched = now;
-        slot.committed = Committed::fresh(episode);
-        Ok(())
+        let mut reset_ids = slot.reset_ids.clone();
+        remember(&mut reset_ids, request_id);
+        Ok(Some(Reset {
+            from,
+            episode,
+            standing: Standing { resets: slot.resets + 1, reset_ids: reset_ids.into(), ..Standing::default() },
+        }))
+    }
+
+    /// Finishes it; None: it could not be kept, and the session stands where it stood.
+    pub fn finish_reset(&self, reset: Option<Reset>) {
+        let mut slot = self.slot.lock();
+        slot.resetting = false;
+        slot.touched = Instant::now();
+        let Some(Reset { from: _, episode, standing }) = reset.filter(|_| !slot.ended) else { return };
+        self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
+        (slot.resets, slot.reset_ids) = (standing.resets, standing.reset_ids.into());
+        slot.committed = Committed { step: standing.step, episode, last: None };
     }
 
     /// Idle time to live.
@@ -374,11 +412,11 @@ impl Session {
             committed_step: slot.committed.step,
             episode: slot.resets,
             detail: in_full.then(detail),
-            age: now.saturating_duration_since(self.opened),
+            age: Duration::from_millis(unix_ms().saturating_sub(self.opened)),
             idle: now.saturating_duration_since(slot.touched),
             ttl: self.ttl,
             state_bytes: episode.size_bytes(),
-            busy: slot.flight.as_ref().is_some_and(|flight| flight.is_wanted()),
+            busy: slot.flight.as_ref().is_some_and(|flight| flight.is_busy()),
         }
     }
 
@@ -397,13 +435,13 @@ impl Session {
     /// When it was last touched, if no act is in flight.
     fn idle_since(&self) -> Option<Instant> {
         let slot = self.slot.lock();
-        slot.flight.is_none().then_some(slot.touched)
+        (slot.flight.is_none() && !slot.resetting).then_some(slot.touched)
     }
 
     /// Ends it if it has been idle for `idle_min`; says whether it did.
     fn end_if_idle(&self, idle_min: Duration, now: Instant) -> bool {
         let mut slot = self.slot.lock();
-        let idle = slot.flight.is_none() && now.saturating_duration_since(slot.touched) >= idle_min;
+        let idle = slot.flight.is_none() && !slot.resetting && now.saturating_duration_since(slot.touched) >= idle_min;
         if idle && !slot.ended {
             self.end_slot(&mut slot);
         }
@@ -445,16 +483,6 @@ impl Slot {
         }
     }
 
-    fn remember(&mut self, reset_id: String) {
-        if reset_id.is_empty() {
-            return;
-        }
-        if self.reset_ids.len() >= RESET_IDS_MAX {
-            self.reset_ids.pop_front();
-        }
-        self.reset_ids.push_back(reset_id);
-    }
-
     /// Frees the place of this flight; says whether it still held it.
     fn release(&mut self, flight: &Arc<Flight>) -> bool {
         let held = self.flight.as_ref().is_some_and(|current| Arc::ptr_eq(current, flight));
@@ -463,4 +491,14 @@ impl Slot {
         }
         held && !self.ended
     }
+}
+
+fn remember(reset_ids: &mut VecDeque<String>, reset_id: String) {
+    if reset_id.is_empty() {
+        return;
+    }
+    if reset_ids.len() >= RESET_IDS_MAX {
+        reset_ids.pop_front();
+    }
+    reset_ids.push_back(reset_id);
 }

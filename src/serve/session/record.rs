@@ -4,20 +4,31 @@
 //! takes its own version and the one before; what was damaged on its way is refused, never repaired. A checksum is no seal: whoever imports a
 //! record may have written it by hand, so that everything in it is checked against the model ([`Agent::adopt`]).
 
-use super::{Answer, Key, RESET_IDS_MAX, Session, Standing, Timings, is_request_id};
+use super::{Answer, Detail, Handle, Key, RESET_IDS_MAX, Session, Standing, Summary, Timings, is_request_id};
 use crate::{
     model::agent::{Agent, Chunk, Episode},
-    serve::error::ServiceError,
+    serve::{
+        error::ServiceError,
+        store::{UnixMs, unix_ms},
+    },
 };
 use crc::{CRC_32_ISCSI, Crc};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use std::{sync::Arc, time::Duration};
+use uuid::Uuid;
 
-const MAGIC: [u8; 4] = *b"ADAS";
+const MAGIC_LEN: usize = 4;
+/// Begins a record that travels.
+const EXPORTED: &[u8; MAGIC_LEN] = b"ADAS";
+/// Begins what a store keeps.
+const KEPT: &[u8; MAGIC_LEN] = b"ADAK";
 /// Of what is written.
 const VERSION: u8 = 1;
+/// Room for a usual one.
+const USUAL_LEN: usize = 8 << 10;
 /// Steps and episodes that are counted.
 const COUNT_MAX: u64 = 1 << 53;
-const HEAD_LEN: usize = MAGIC.len() + 1 + size_of::<u32>();
+const HEAD_LEN: usize = MAGIC_LEN + 1 + size_of::<u32>();
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
 /// What is written down of a session.
@@ -37,7 +48,7 @@ pub struct Record {
     /// Names of the last requests that reset it.
     pub reset_ids: Vec<String>,
     /// The running episode.
-    pub episode: Episode,
+    pub episode: Arc<Episode>,
     /// The last answer, for whoever lost it.
     pub last: Option<Last>,
 }
@@ -49,7 +60,7 @@ pub struct Last {
     /// See [`super::key_of`].
     pub key: Key,
     /// What the model said.
-    pub chunk: Chunk,
+    pub chunk: Arc<Chunk>,
     /// Where the time went.
     pub timings: Timings,
 }
@@ -80,7 +91,7 @@ impl Record {
         let (episode, Standing { step, resets, reset_ids, last }) = session.standing((None, None))?;
         let (model, model_digest) = (session.model.to_string(), session.agent.spec().digest.clone());
         let ttl_ms = session.ttl().as_millis() as u64;
-        Ok(Self { model, model_digest, ttl_ms, step, resets, reset_ids, episode: (*episode).clone(), last })
+        Ok(Self { model, model_digest, ttl_ms, step, resets, reset_ids, episode, last })
     }
 
     /// As bytes.
@@ -88,13 +99,7 @@ impl Record {
     /// # Errors
     /// If the format cannot express it, which is a defect.
     pub fn write(&self) -> Result<Vec<u8>, rmp_serde::encode::Error> {
-        let body = rmp_serde::to_vec_named(self)?;
-        let mut bytes = Vec::with_capacity(HEAD_LEN + body.len());
-        bytes.extend_from_slice(&MAGIC);
-        bytes.push(VERSION);
-        bytes.extend_from_slice(&CRC.checksum(&body).to_le_bytes());
-        bytes.extend_from_slice(&body);
-        Ok(bytes)
+        write(*EXPORTED, self)
     }
 
     /// From bytes.
@@ -102,23 +107,14 @@ impl Record {
     /// # Errors
     /// [`Unreadable`].
     pub fn read(bytes: &[u8]) -> Result<Self, Unreadable> {
-        let rest = bytes.strip_prefix(&MAGIC).ok_or(Unreadable::Foreign)?;
-        let (version, rest) = rest.split_first().ok_or(Unreadable::Damaged)?;
-        let (sum, body) = rest.split_first_chunk().ok_or(Unreadable::Damaged)?;
-        if *version > VERSION {
-            return Err(Unreadable::Newer(*version));
-        }
-        if *version < VERSION || u32::from_le_bytes(*sum) != CRC.checksum(body) {
-            return Err(Unreadable::Damaged);
-        }
-        rmp_serde::from_slice(body).map_err(|error| Unreadable::Malformed(error.to_string()))
+        read(EXPORTED, bytes)
     }
 
     /// Where its session stood, if the model could have left it there; else what of it is wrong.
     ///
     /// # Errors
     /// `(field, reason)`.
-    pub fn standing(self, agent: &Agent) -> Result<(Episode, Standing), (String, String)> {
+    pub fn standing(self, agent: &Agent) -> Result<(Arc<Episode>, Standing), (String, String)> {
         let Self { model: _, model_digest: _, ttl_ms: _, step, resets, reset_ids, episode, last } = self;
         let misfit = |field: &str| (field.to_owned(), "is none of this session".to_owned());
         // Each step has an answer; the next one can be counted.
@@ -132,9 +128,96 @@ impl Record {
         if reset_ids.len() > RESET_IDS_MAX || !reset_ids.iter().all(|id| is_request_id(id)) {
             return Err(misfit("reset_ids"));
         }
-        let episode = agent.adopt(episode).map_err(|error| ("episode".to_owned(), error.to_string()))?;
+        agent.adopt(&episode).map_err(|error| ("episode".to_owned(), error.to_string()))?;
         Ok((episode, Standing { step, resets, reset_ids, last }))
     }
+}
+
+/// What a store keeps of a session: its record, and what is told to nobody else.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Kept {
+    /// The session's id.
+    pub id: Uuid,
+    /// Name of the request that opened it; empty: none.
+    pub request_id: String,
+    /// When it was opened.
+    pub opened: UnixMs,
+    /// When it was touched, as far as commits tell.
+    pub touched: UnixMs,
+    /// Where it stands.
+    pub record: Record,
+}
+
+impl Kept {
+    /// As bytes.
+    ///
+    /// # Errors
+    /// If the format cannot express it, which is a defect.
+    pub fn write(&self) -> Result<Vec<u8>, rmp_serde::encode::Error> {
+        write(*KEPT, self)
+    }
+
+    /// From bytes.
+    ///
+    /// # Errors
+    /// [`Unreadable`].
+    pub fn read(bytes: &[u8]) -> Result<Self, Unreadable> {
+        read(KEPT, bytes)
+    }
+}
+
+impl Kept {
+    /// The session in numbers, as far as what is kept tells.
+    pub fn summary(self, handle: Handle, in_full: bool) -> Summary {
+        let Self { id: _, request_id: _, opened, touched, record } = self;
+        let Record { model, model_digest, ttl_ms, step, resets, reset_ids: _, episode, last: _ } = record;
+        let now = unix_ms();
+        let since = |then: UnixMs| Duration::from_millis(now.saturating_sub(then));
+        let detail = || Detail {
+            model_digest,
+            seed: episode.seed(),
+            options: episode.options().clone(),
+            latent: episode.latent().map(|(mean, log_var)| (mean.to_vec(), log_var.to_vec())),
+        };
+        Summary {
+            id: None,
+            handle,
+            model: model.into(),
+            committed_step: step,
+            episode: resets,
+            detail: in_full.then(detail),
+            age: since(opened),
+            idle: since(touched),
+            ttl: Duration::from_millis(ttl_ms),
+            state_bytes: episode.size_bytes(),
+            busy: false,
+        }
+    }
+}
+
+fn write(magic: [u8; MAGIC_LEN], value: &impl Serialize) -> Result<Vec<u8>, rmp_serde::encode::Error> {
+    let mut bytes = Vec::with_capacity(USUAL_LEN);
+    bytes.extend_from_slice(&magic);
+    bytes.push(VERSION);
+    bytes.extend_from_slice(&[0; size_of::<u32>()]);
+    value.serialize(&mut rmp_serde::Serializer::new(&mut bytes).with_struct_map())?;
+    let sum = CRC.checksum(&bytes[HEAD_LEN..]);
+    bytes[HEAD_LEN - size_of::<u32>()..HEAD_LEN].copy_from_slice(&sum.to_le_bytes());
+    Ok(bytes)
+}
+
+fn read<T: DeserializeOwned>(magic: &[u8; MAGIC_LEN], bytes: &[u8]) -> Result<T, Unreadable> {
+    let rest = bytes.strip_prefix(magic).ok_or(Unreadable::Foreign)?;
+    let (version, rest) = rest.split_first().ok_or(Unreadable::Damaged)?;
+    let (sum, body) = rest.split_first_chunk().ok_or(Unreadable::Damaged)?;
+    if *version > VERSION {
+        return Err(Unreadable::Newer(*version));
+    }
+    if *version < VERSION || u32::from_le_bytes(*sum) != CRC.checksum(body) {
+        return Err(Unreadable::Damaged);
+    }
+    rmp_serde::from_slice(body).map_err(|error| Unreadable::Malformed(error.to_string()))
 }
 
 impl Last {
@@ -152,7 +235,7 @@ mod tests {
         model::{agent::Observation, checkpoint},
         serve::session::key_of,
     };
-    use std::{path::Path, sync::Arc};
+    use std::path::Path;
 
     fn acted() -> (Arc<Agent>, Record) {
         let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
@@ -160,9 +243,9 @@ mod tests {
         let mut standing = (agent.open(1, &agent.config().defaults.sampler).unwrap(), None);
         for i in 0..3 {
             let (episode, chunk) = agent.act(&standing.0, &seen(i)).unwrap();
-            standing = (episode, Some(Last { key: key_of(&seen(i)), chunk, timings: Timings::default() }));
+            standing = (episode, Some(Last { key: key_of(&seen(i)), chunk: Arc::new(chunk), timings: Timings::default() }));
         }
-        let (episode, last) = standing;
+        let (episode, last) = (Arc::new(standing.0), standing.1);
         let (model, model_digest, reset_ids) = ("tiny".to_owned(), agent.spec().digest.clone(), vec!["a".to_owned()]);
         (agent, Record { model, model_digest, ttl_ms: 60_000, step: 3, resets: 1, reset_ids, episode, last })
     }
@@ -189,7 +272,7 @@ mod tests {
             Record::read(&bytes[..i]).unwrap_err();
         }
         assert_eq!(Record::read(b"PK"), Err(Unreadable::Foreign));
-        let newer = [&MAGIC[..], &[VERSION + 1], &bytes[5..]].concat();
+        let newer = [&EXPORTED[..], &[VERSION + 1], &bytes[5..]].concat();
         assert_eq!(Record::read(&newer), Err(Unreadable::Newer(VERSION + 1)));
         assert_eq!(Record::read(&[&bytes[..], &[0]].concat()), Err(Unreadable::Damaged));
     }
@@ -237,7 +320,10 @@ mod tests {
         assert_eq!(wrong(|record| record.reset_ids = vec!["a".to_owned(); RESET_IDS_MAX + 1]), "reset_ids");
         assert_eq!(wrong(|record| record.reset_ids = vec![String::new()]), "reset_ids");
         assert_eq!(wrong(|record| record.reset_ids = vec!["a".repeat(65)]), "reset_ids");
-        assert_eq!(wrong(|record| record.last.iter_mut().for_each(|last| last.chunk.actions[0].push(0.0))), "last");
-        assert_eq!(wrong(|record| record.last.iter_mut().for_each(|last| last.chunk.latent_mean[0] = f32::NAN)), "last");
+        assert_eq!(wrong(|record| record.last.iter_mut().for_each(|last| Arc::make_mut(&mut last.chunk).actions[0].push(0.0))), "last");
+        assert_eq!(
+            wrong(|record| record.last.iter_mut().for_each(|last| Arc::make_mut(&mut last.chunk).latent_mean[0] = f32::NAN)),
+            "last"
+        );
     }
 }

@@ -4,6 +4,7 @@ use crate::serve::{
     config::SessionsConfig,
     error::ServiceError,
     session::{Handle, Opening, Session},
+    store::{Ending, Store},
 };
 use parking_lot::Mutex;
 use std::{
@@ -21,29 +22,6 @@ const SHARDS: usize = 16;
 /// Sessions that one eviction looks at: a refusal must not cost more than an act.
 const LOOKS_MAX: usize = 64;
 
-/// How a session ended without its client.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Ending {
-    Expired,
-    Evicted,
-}
-
-impl Ending {
-    fn word(self) -> &'static str {
-        match self {
-            Ending::Expired => "expired",
-            Ending::Evicted => "evicted",
-        }
-    }
-
-    fn error(self) -> ServiceError {
-        match self {
-            Ending::Expired => ServiceError::SessionExpired,
-            Ending::Evicted => ServiceError::SessionEvicted,
-        }
-    }
-}
-
 /// The table. Locks are taken in the order shard, slot; those of `idle`, `unused` and `opened` come last, and hold nothing
 /// else. All are held for moments.
 pub struct Sessions {
@@ -57,6 +35,8 @@ pub struct Sessions {
     len: AtomicUsize,
     bytes: Arc<AtomicUsize>,
     config: SessionsConfig,
+    /// Where they are kept as well; None: they are here alone.
+    store: Option<Arc<Store>>,
 }
 
 #[derive(Default)]
@@ -96,7 +76,7 @@ impl Idle {
 
 impl Sessions {
     /// An empty table.
-    pub fn new(config: SessionsConfig) -> Self {
+    pub fn new(config: SessionsConfig, store: Option<Arc<Store>>) -> Self {
         Self {
             shards: Default::default(),
             idle: Mutex::default(),
@@ -105,6 +85,7 @@ impl Sessions {
             len: AtomicUsize::new(0),
             bytes: Arc::default(),
             config,
+            store,
         }
     }
 
@@ -150,24 +131,51 @@ impl Sessions {
         same_model(other, &model)
     }
 
+    /// Takes in a session that comes back from the store, unless it is here already.
+    ///
+    /// # Errors
+    /// `Quota` if there is no room.
+    pub fn revive(&self, opening: Opening, now: Instant) -> Result<Arc<Session>, ServiceError> {
+        self.make_room(opening.episode.size_bytes(), now)?;
+        let session = Arc::new(Session::new(opening, self.bytes.clone(), now));
+        let live = self.shard(session.handle).lock().live.entry(session.handle).or_insert_with(|| session.clone()).clone();
+        if !Arc::ptr_eq(&live, &session) {
+            self.len.fetch_sub(1, Ordering::Relaxed);
+            session.end();
+            return Ok(live);
+        }
+        self.unused.lock().file(session.handle, now);
+        if !session.request_id.is_empty() {
+            self.opened.lock().insert(session.request_id.clone(), session.id);
+        }
+        metrics::counter!("ada_sessions_revived_total").increment(1);
+        Ok(session)
+    }
+
     fn opened(&self, name: &str, now: Instant) -> Option<Arc<Session>> {
         let id = *self.opened.lock().get(name)?;
         self.get(id, now).ok()
     }
 
     fn add(&self, opening: Opening, now: Instant) -> Result<Arc<Session>, ServiceError> {
-        while self.bytes() + opening.episode.size_bytes() > self.config.bytes_max {
+        self.make_room(opening.episode.size_bytes(), now)?;
+        let session = Arc::new(Session::new(opening, self.bytes.clone(), now));
+        self.shard(session.handle).lock().live.insert(session.handle, session.clone());
+        self.unused.lock().file(session.handle, now);
+        metrics::counter!("ada_sessions_created_total").increment(1);
+        Ok(session)
+    }
+
+    /// Takes a place, evicting idle sessions where there is none.
+    fn make_room(&self, bytes: usize, now: Instant) -> Result<(), ServiceError> {
+        while self.bytes() + bytes > self.config.bytes_max {
             self.evict(now)?;
         }
         while self.len.fetch_add(1, Ordering::Relaxed) >= self.config.len_max {
             self.len.fetch_sub(1, Ordering::Relaxed);
             self.evict(now)?;
         }
-        let session = Arc::new(Session::new(opening, self.bytes.clone(), now));
-        self.shard(session.handle).lock().live.insert(session.handle, session.clone());
-        self.unused.lock().file(session.handle, now);
-        metrics::counter!("ada_sessions_created_total").increment(1);
-        Ok(session)
+        Ok(())
     }
 
     /// A live session, touched.
@@ -188,14 +196,14 @@ impl Sessions {
             }
             return Ok(session);
         }
-        Err(shard.ended.get(&handle).map_or(ServiceError::SessionNotFound, |ending| ending.error()))
+        Err(shard.ended.get(&handle).map_or(ServiceError::SessionNotFound, |ending| ServiceError::ended(*ending)))
     }
 
     /// Ends a session; an act in flight is dropped.
     ///
     /// # Errors
     /// As [`Sessions::get`].
-    pub fn close(&self, id: Uuid, now: Instant) -> Result<(), ServiceError> {
+    pub fn close(&self, id: Uuid, now: Instant) -> Result<Arc<Session>, ServiceError> {
         let session = self.get(id, now)?;
         if self.shard(session.handle).lock().live.remove(&session.handle).is_none() {
             return Err(ServiceError::SessionNotFound);
@@ -203,7 +211,7 @@ impl Sessions {
         self.forget(&session);
         session.end();
         metrics::counter!("ada_sessions_ended_total", "reason" => "closed").increment(1);
-        Ok(())
+        Ok(session)
     }
 
     /// Ends a session, unless somebody has asked for it since it was opened: then its id is known.
@@ -212,8 +220,14 @@ impl Sessions {
         if session.is_unused() && shard.live.remove(&session.handle).is_some() {
             self.forget(session);
             session.end();
+            self.free(session, None);
             metrics::counter!("ada_sessions_ended_total", "reason" => "undone").increment(1);
         }
+    }
+
+    /// One that is in memory, as it is.
+    pub fn live(&self, handle: Handle) -> Option<Arc<Session>> {
+        self.shard(handle).lock().live.get(&handle).cloned()
     }
 
     /// Up to `len` sessions with handles above `after`, in order of handle.
@@ -261,8 +275,8 @@ impl Sessions {
                 continue;
             };
             let since = session.idle_since().unwrap_or(now);
-            if since == filed && session.end_if_idle(idle_min, now) {
-                self.bury(&mut shard, handle, Ending::Evicted, now);
+            if since == filed && self.is_ours(&session) && session.end_if_idle(idle_min, now) {
+                self.make_go(&mut shard, handle, now);
                 return Ok(());
             }
             // Touched since: another one may have been idle for longer.
@@ -280,14 +294,38 @@ impl Sessions {
             let Some((_, handle)) = self.unused.lock().first(idle_min, now) else { break };
             let mut shard = self.shard(handle).lock();
             let session = shard.live.get(&handle).cloned();
-            if session.is_some_and(|session| session.is_unused() && session.end_if_idle(idle_min, now)) {
-                self.bury(&mut shard, handle, Ending::Evicted, now);
+            if session.is_some_and(|session| session.is_unused() && self.is_ours(&session) && session.end_if_idle(idle_min, now)) {
+                self.make_go(&mut shard, handle, now);
                 return true;
             }
             // It has ended, or was asked for, a moment ago.
             self.unused.lock().forget(handle);
         }
         false
+    }
+
+    /// Whether nobody is about to use a session that will come back from the store as another value: to be asked with its shard locked, and one hold of
+    /// one's own on it.
+    fn is_ours(&self, session: &Arc<Session>) -> bool {
+        self.store.is_none() || Arc::strong_count(session) <= 2
+    }
+
+    /// Takes the place of a session: where it is kept elsewhere it comes back when somebody asks for it, else it ends.
+    fn make_go(&self, shard: &mut Shard, handle: Handle, now: Instant) {
+        if self.store.is_none() {
+            return self.bury(shard, handle, Ending::Evicted, now);
+        }
+        if let Some(session) = shard.live.remove(&handle) {
+            self.forget(&session);
+            metrics::counter!("ada_sessions_spilled_total").increment(1);
+        }
+    }
+
+    /// Its place in the store, if it has one. Nobody waits for that: until it is done, what is asked finds the session as it was.
+    fn free(&self, session: &Session, ending: Option<Ending>) {
+        if let Some(store) = &self.store {
+            store.submit(session.freed(ending), |_freed| ());
+        }
     }
 
     /// What is known of a session beside its shard.
@@ -306,6 +344,7 @@ impl Sessions {
     fn bury(&self, shard: &mut Shard, handle: Handle, ending: Ending, now: Instant) {
         let Some(session) = shard.live.remove(&handle) else { return };
         self.forget(&session);
+        self.free(&session, Some(ending));
         metrics::counter!("ada_sessions_ended_total", "reason" => ending.word()).increment(1);
         shard.ended.insert(handle, ending);
         shard.endings.push_back((now, handle));
@@ -351,9 +390,17 @@ mod tests {
         let opening = move || {
             let (options, ttl) = (agent.config().defaults.sampler.clone(), 60 * MINUTE);
             let episode = agent.open(1, &options).unwrap();
-            Opening { model: "tiny".into(), agent: agent.clone(), episode, standing: Standing::default(), ttl, request_id: String::new() }
+            Opening {
+                model: "tiny".into(),
+                agent: agent.clone(),
+                episode: Arc::new(episode),
+                standing: Standing::default(),
+                ttl,
+                request_id: String::new(),
+                known: None,
+            }
         };
-        (Sessions::new(SessionsConfig { len_max, evict_idle_ms: 60_000, ..SessionsConfig::default() }), opening)
+        (Sessions::new(SessionsConfig { len_max, evict_idle_ms: 60_000, ..SessionsConfig::default() }, None), opening)
     }
 
     #[test]

@@ -11,7 +11,7 @@ pub use embedded::{Durability, Embedded};
 pub use writer::{Outcome, Store};
 
 use crate::serve::session::Handle;
-use std::fmt;
+use std::time::SystemTime;
 
 /// Where a session stands: what the next commit goes on from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -82,6 +82,11 @@ pub type Name = [u8; 16];
 
 /// Wall clock, in milliseconds since 1970.
 pub type UnixMs = u64;
+
+/// Now.
+pub fn unix_ms() -> UnixMs {
+    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_millis() as UnixMs)
+}
 
 /// A change of one session's place.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -167,11 +172,12 @@ pub struct Size {
     pub bytes: u64,
 }
 
-impl fmt::Display for Ending {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
+impl Ending {
+    /// The word in metrics.
+    pub fn word(self) -> &'static str {
+        match self {
             Ending::Expired => "expired",
             Ending::Evicted => "evicted",
-        })
+        }
     }
 }

@@ -15,6 +15,7 @@ mod limits;
 mod methods;
 mod records;
 mod steps;
+mod store;
 mod streams;
 
 use ada_diffuser::{

@@ -10,7 +10,8 @@ fn written(episode: &Episode) -> Value {
 }
 
 fn read(agent: &Agent, written: &Value) -> Result<Episode, AgentError> {
-    agent.adopt(serde_json::from_value(written.clone()).unwrap())
+    let episode = serde_json::from_value(written.clone()).unwrap();
+    agent.adopt(&episode).map(|()| episode)
 }
 
 fn plain(options: &SamplerOptions) -> SamplerOptions {

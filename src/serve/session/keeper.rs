@@ -1,0 +1,297 @@
+//! Sessions wherever they are: in memory, and in the store behind it. What changes one of them is kept before it is told; one that is not in memory comes
+//! back when somebody asks for it.
+
+use super::{Handle, Kept, Opening, Session, Sessions, Summary, name_of};
+use crate::{
+    model::agent::Episode,
+    serve::{
+        config::{SessionsConfig, StoreConfig},
+        error::ServiceError,
+        registry::Registry,
+        store::{Change, Embedded, Ending, Outcome, Place, Store, StoreError, UnixMs, VERSION_LEN, Write, unix_ms},
+    },
+};
+use parking_lot::Mutex;
+use std::{
+    io,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+use tokio::{sync::oneshot, task::spawn_blocking};
+use uuid::Uuid;
+
+/// Pages of the store that one page of a list looks at: a list of one model among many must not take for ever.
+const PAGES_MAX: usize = 8;
+
+/// Why there is no place for sessions.
+#[derive(Debug, thiserror::Error)]
+pub enum KeeperError {
+    /// The store cannot be opened.
+    #[error("store.dir {dir}: {reason}")]
+    Store {
+        /// The setting.
+        dir: String,
+        /// Why not.
+        reason: StoreError,
+    },
+    /// No thread for it.
+    #[error("store: {0}")]
+    Thread(io::Error),
+}
+
+/// See the module.
+pub struct Keeper {
+    table: Arc<Sessions>,
+    store: Option<Arc<Store>>,
+    config: StoreConfig,
+    tombstone_ttl: Duration,
+    /// No session expires for what went by before: the clock may have jumped, and its client could not reach it.
+    started: UnixMs,
+    /// Where the search for expired sessions stands.
+    swept: Mutex<Option<Handle>>,
+}
+
+impl Keeper {
+    /// Opens the store, if the settings name one.
+    ///
+    /// # Errors
+    /// If it cannot be opened.
+    pub fn open_store(sessions: &SessionsConfig, config: &StoreConfig) -> Result<Self, KeeperError> {
+        let store = if config.dir.as_os_str().is_empty() { None } else { Some(Arc::new(start(config)?)) };
+        Ok(Self {
+            table: Arc::new(Sessions::new(sessions.clone(), store.clone())),
+            store,
+            config: config.clone(),
+            tombstone_ttl: Duration::from_millis(sessions.tombstone_ttl_ms),
+            started: unix_ms(),
+            swept: Mutex::default(),
+        })
+    }
+
+    /// Those in memory.
+    pub fn table(&self) -> &Arc<Sessions> {
+        &self.table
+    }
+
+    /// Where commits go first.
+    pub fn store(&self) -> Option<Arc<Store>> {
+        self.store.clone()
+    }
+
+    /// A session, touched, from memory or from the store.
+    ///
+    /// # Errors
+    /// `SessionNotFound` and its kin; of one in the store `ModelGone`, `StateCorrupt`, `StoreUnavailable`, `Quota`.
+    pub async fn find(&self, id: Uuid, registry: &Registry) -> Result<Arc<Session>, ServiceError> {
+        let found = self.table.get(id, Instant::now());
+        match (&found, &self.store) {
+            (Err(ServiceError::SessionNotFound), Some(_)) => {}
+            _ => return found,
+        }
+        self.bring_back(Handle::of(id), registry).await?;
+        self.table.get(id, Instant::now())
+    }
+
+    async fn bring_back(&self, handle: Handle, registry: &Registry) -> Result<Arc<Session>, ServiceError> {
+        let Some(store) = self.store.clone() else { return Err(ServiceError::SessionNotFound) };
+        let read = spawn_blocking(move || store.read(handle)).await.map_err(|error| ServiceError::internal(&error))?;
+        match read.map_err(|error| ServiceError::from_store(&error))? {
+            Place::Empty => Err(ServiceError::SessionNotFound),
+            Place::Ended(ending) => Err(ServiceError::ended(ending)),
+            Place::Kept(bytes) => self.revive(handle, &bytes, registry),
+        }
+    }
+
+    fn revive(&self, handle: Handle, bytes: &[u8], registry: &Registry) -> Result<Arc<Session>, ServiceError> {
+        let kept = read(bytes)?;
+        if self.has_expired(&kept) {
+            self.expire(handle, &kept);
+            return Err(ServiceError::SessionExpired);
+        }
+        let Kept { id, request_id, opened, touched: _, record } = kept;
+        let model = registry.pinned(&record.model, &record.model_digest)?.clone();
+        let ttl = Duration::from_millis(record.ttl_ms);
+        let damaged = |(field, reason): (String, String)| ServiceError::corrupt(&format!("{field}: {reason}"));
+        let (episode, standing) = record.standing(&model.agent).map_err(damaged)?;
+        let opening = Opening { model: model.name, agent: model.agent, episode, standing, ttl, request_id, known: Some((id, opened)) };
+        self.table.revive(opening, Instant::now())
+    }
+
+    /// Opens a session; or gives that which a request of this name has opened, before a restart too.
+    ///
+    /// # Errors
+    /// Those of [`Sessions::open`]; `StoreFull`, `StoreUnavailable`.
+    pub async fn open(&self, opening: Opening, registry: &Registry) -> Result<Arc<Session>, ServiceError> {
+        let Some(store) = self.store.clone() else { return self.table.open(opening, Instant::now()) };
+        if let Some(name) = name_of(&opening.request_id) {
+            let home = store.home().clone();
+            let named = spawn_blocking(move || home.named(name)).await.map_err(|error| ServiceError::internal(&error))?;
+            if let Some(handle) = named.map_err(|error| ServiceError::from_store(&error))? {
+                // It has come back, or is there, or is gone: the table tells.
+                let _gone = self.bring_back(handle, registry).await;
+            }
+        }
+        let session = self.table.open(opening, Instant::now())?;
+        let kept = self.keep(session.opened()?, |_| ()).await;
+        match kept {
+            // Another request of its name has kept it.
+            Ok(Ok(()) | Err(_)) => Ok(session),
+            Err(error) => {
+                self.table.undo(&session);
+                Err(ServiceError::from_store(&error))
+            }
+        }
+    }
+
+    /// A new episode.
+    ///
+    /// # Errors
+    /// Those of [`Session::begin_reset`]; `StoreFull`, `StoreUnavailable`.
+    pub async fn reset(
+        &self,
+        session: &Arc<Session>,
+        renew: impl FnOnce(&Episode) -> Result<Episode, ServiceError>,
+        ends: Option<u64>,
+        request_id: String,
+    ) -> Result<(), ServiceError> {
+        let Some(reset) = session.begin_reset(renew, ends, request_id, Instant::now())? else { return Ok(()) };
+        if self.store.is_none() {
+            session.finish_reset(Some(reset));
+            return Ok(());
+        }
+        let write = match session.about_to_reset(&reset) {
+            Ok(write) => write,
+            Err(error) => {
+                session.finish_reset(None);
+                return Err(error);
+            }
+        };
+        let its = session.clone();
+        // Whoever asked may be gone by then: the writer finishes it.
+        let kept = self.keep(write, move |outcome| its.finish_reset(Some(reset).filter(|_| matches!(outcome, Ok(Ok(())))))).await;
+        match kept {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(_)) => Err(ServiceError::SessionNotFound),
+            Err(error) => Err(ServiceError::from_store(&error)),
+        }
+    }
+
+    /// Ends a session.
+    ///
+    /// # Errors
+    /// `SessionNotFound` and its kin; `StoreUnavailable`, after which it may be closed again.
+    pub async fn close(&self, id: Uuid, registry: &Registry) -> Result<(), ServiceError> {
+        self.find(id, registry).await?;
+        let session = self.table.close(id, Instant::now())?;
+        if self.store.is_none() {
+            return Ok(());
+        }
+        self.keep(session.freed(None), |_| ()).await.map_err(|error| ServiceError::from_store(&error)).map(|_freed| ())
+    }
+
+    /// Writes, and waits; `then` is called on the writer's thread, whether or not anybody still waits here.
+    async fn keep(&self, write: Write, then: impl FnOnce(&Outcome) + Send + 'static) -> Outcome {
+        let Some(store) = &self.store else { return Ok(Ok(())) };
+        let (told, outcome) = oneshot::channel();
+        store.submit(write, move |outcome| {
+            then(&outcome);
+            // Whoever asked may be gone.
+            let _gone = told.send(outcome);
+        });
+        outcome.await.unwrap_or_else(|_| Err(StoreError::Unavailable("its thread has ended".into())))
+    }
+
+    /// Up to `len` sessions with handles above `after`, in order of handle, and where the next page begins.
+    ///
+    /// # Errors
+    /// `StoreUnavailable`.
+    pub async fn page(
+        &self,
+        after: Option<Handle>,
+        model: Option<&str>,
+        (len, in_full): (usize, bool),
+    ) -> Result<(Vec<Summary>, Option<Handle>), ServiceError> {
+        let now = Instant::now();
+        let Some(store) = &self.store else {
+            let mut found = self.table.page(after, model, len + 1);
+            let more = found.len() > len;
+            found.truncate(len);
+            let next = found.last().filter(|_| more).map(|session| session.handle);
+            return Ok((found.iter().map(|session| session.listed(in_full, now)).collect(), next));
+        };
+        let (mut summaries, mut after) = (Vec::new(), after);
+        for _ in 0..PAGES_MAX {
+            let (home, from) = (store.home().clone(), after);
+            let page = spawn_blocking(move || home.page(from, len + 1)).await.map_err(|error| ServiceError::internal(&error))?;
+            let page = page.map_err(|error| ServiceError::from_store(&error))?;
+            let more = page.len() > len;
+            for (handle, bytes) in page.into_iter().take(len) {
+                after = Some(handle);
+                let Some(summary) = self.summary(handle, &bytes, in_full, now) else { continue };
+                if model.is_none_or(|model| *summary.model == *model) {
+                    summaries.push(summary);
+                }
+                if summaries.len() == len {
+                    return Ok((summaries, after));
+                }
+            }
+            if !more {
+                return Ok((summaries, None));
+            }
+        }
+        Ok((summaries, after))
+    }
+
+    /// Of a session in the store; None of one that is damaged or has expired.
+    fn summary(&self, handle: Handle, bytes: &[u8], in_full: bool, now: Instant) -> Option<Summary> {
+        if let Some(live) = self.table.live(handle) {
+            return Some(live.listed(in_full, now));
+        }
+        let kept = read(bytes).ok().filter(|kept| !self.has_expired(kept))?;
+        Some(kept.summary(handle, in_full))
+    }
+
+    fn has_expired(&self, kept: &Kept) -> bool {
+        unix_ms() >= kept.touched.max(self.started).saturating_add(kept.record.ttl_ms)
+    }
+
+    fn expire(&self, handle: Handle, kept: &Kept) {
+        let change = Change::Free { ending: Some((Ending::Expired, unix_ms())), name: name_of(&kept.request_id) };
+        if let Some(store) = &self.store {
+            store.submit(Write { handle, change }, |_freed| ());
+            metrics::counter!("ada_sessions_ended_total", "reason" => Ending::Expired.word()).increment(1);
+        }
+    }
+
+    /// Ends what has expired, in memory and, a few at a time, in the store. Blocks for moments.
+    pub fn reap(&self) {
+        self.table.reap(Instant::now());
+        let Some(store) = &self.store else { return };
+        let mut swept = self.swept.lock();
+        let Ok(page) = store.home().page(*swept, self.config.sweep_len) else { return };
+        *swept = page.last().filter(|_| page.len() == self.config.sweep_len).map(|(handle, _)| *handle);
+        for (handle, bytes) in page {
+            if self.table.live(handle).is_none()
+                && let Ok(kept) = read(&bytes)
+                && self.has_expired(&kept)
+            {
+                self.expire(handle, &kept);
+            }
+        }
+        if swept.is_none() {
+            let before = unix_ms().saturating_sub(self.tombstone_ttl.as_millis() as UnixMs);
+            // What is not forgotten now is forgotten in the next round.
+            let _forgotten = store.home().forget_endings(before);
+        }
+    }
+}
+
+fn start(config: &StoreConfig) -> Result<Store, KeeperError> {
+    let home = Embedded::open(&config.dir, config.durability, config.cache_bytes);
+    let home = home.map_err(|reason| KeeperError::Store { dir: config.dir.display().to_string(), reason })?;
+    Store::start(Arc::new(home), config.queue_len_max).map_err(KeeperError::Thread)
+}
+
+fn read(bytes: &[u8]) -> Result<Kept, ServiceError> {
+    Kept::read(bytes.get(VERSION_LEN..).unwrap_or_default()).map_err(|error| ServiceError::corrupt(&error))
+}
