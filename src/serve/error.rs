@@ -2,7 +2,7 @@
 
 use crate::{
     model::agent::AgentError,
-    serve::store::{Ending, StoreError},
+    serve::store::{Ending, Refused, StoreError},
 };
 use uuid::Uuid;
 
@@ -205,8 +205,20 @@ impl ServiceError {
     pub fn from_store(error: &StoreError) -> Self {
         match error {
             StoreError::Full(_) => Self::StoreFull,
-            StoreError::Unavailable(_) => Self::StoreUnavailable { retry_after_ms: STORE_RETRY_AFTER_MS },
+            StoreError::Unavailable(_) => Self::store_unavailable(),
         }
+    }
+
+    /// What the store said of one write. After a conflict the session is as it is kept: who asks again is told.
+    pub fn from_refused(refused: Refused) -> Self {
+        match refused {
+            Refused::Conflict => Self::store_unavailable(),
+            Refused::Full => Self::StoreFull,
+        }
+    }
+
+    fn store_unavailable() -> Self {
+        Self::StoreUnavailable { retry_after_ms: STORE_RETRY_AFTER_MS }
     }
 
     /// `cause` goes to the log, only its id to the client.

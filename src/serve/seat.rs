@@ -6,7 +6,7 @@ use crate::{
         engine::{Failure, Finished, Patience, Ticket},
         error::{ServiceError, Stage},
         session::{Answer, Flight, Session, Timings},
-        store::{Conflict, Store},
+        store::Store,
     },
 };
 use std::{sync::Arc, time::Instant};
@@ -60,13 +60,16 @@ impl Ticket for Seat {
 
 impl Seat {
     /// Commits before anybody is told: in memory, or, where there is a store, there first.
-    fn commit(self, episode: Arc<Episode>, answer: Arc<Answer>) {
-        let Some(store) = self.store.clone() else { return self.session.commit(&self.flight, episode, answer) };
+    fn commit(mut self, episode: Arc<Episode>, answer: Arc<Answer>) {
+        // Taken: what waits in the store must not hold the store.
+        let Some(store) = self.store.take() else { return self.session.commit(&self.flight, episode, answer) };
         match self.session.about_to_commit(&self.flight, &episode, &answer) {
             Ok(Some(write)) => store.submit(write, move |outcome| match outcome {
                 Ok(Ok(())) => self.session.commit(&self.flight, episode, answer),
-                // Another server has gone on with the session.
-                Ok(Err(Conflict)) => self.session.fail(&self.flight, ServiceError::SessionNotFound),
+                Ok(Err(refused)) => {
+                    self.session.fail(&self.flight, ServiceError::from_refused(refused));
+                    self.session.overtaken(refused);
+                }
                 Err(error) => self.session.fail(&self.flight, ServiceError::from_store(&error)),
             }),
             Ok(None) => self.session.fail(&self.flight, ServiceError::SessionNotFound),

@@ -108,9 +108,10 @@ impl Service {
         &self.draining
     }
 
-    /// Ends the engine; see [`Engine::stop`].
+    /// Ends the engine, see [`Engine::stop`], and then the store: what is committed is kept.
     pub fn stop(&self, patience: Duration) {
         self.engine.stop(patience);
+        self.keeper.stop();
     }
 
     /// Whether every worker shows signs of life.
@@ -126,12 +127,13 @@ impl Service {
         self.registry().map(|_| ())
     }
 
-    /// Whether it takes new work and gets it done: models loaded, not draining, every worker alive.
+    /// Whether it takes new work and gets it done: models loaded, not draining, commits kept, every worker alive.
     ///
     /// # Errors
     /// Why not.
     pub fn ready(&self) -> Result<(), String> {
         self.accepts().map_err(|error| error.to_string())?;
+        self.keeper.is_sound().map_err(|error| error.to_string())?;
         if self.is_alive() { Ok(()) } else { Err("a worker of the engine is silent".to_owned()) }
     }
 

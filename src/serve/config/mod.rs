@@ -138,11 +138,11 @@ pub struct SessionsConfig {
 pub struct StoreConfig {
     /// Directory of the embedded store; empty: sessions are in memory alone, and end with the process.
     pub dir: PathBuf,
-    /// What a commit survives: the end of the `process`, or that of the `power`.
+    /// What a commit survives: nothing (`memory`), the end of the `process`, or that of the `power`.
     pub durability: Durability,
     /// Sessions that are kept, those in memory among them; one more is refused (STORE_FULL).
     pub len_max: u64,
-    /// Bytes of its file; beyond it no session is opened (STORE_FULL), and those that are there go on.
+    /// Bytes of its file. At a third of it, in records, no session more is opened (STORE_FULL), and those that are there go on.
     pub bytes_max: u64,
     /// Memory for its pages.
     pub cache_bytes: usize,
@@ -432,8 +432,8 @@ impl Config {
     }
 
     /// Settings that make no sense as 0.
-    fn positive(&self) -> [(&'static str, u64); 29] {
-        let (connection, limits, sessions, engine) = (&self.connection, &self.limits, &self.sessions, &self.engine);
+    fn positive(&self) -> [(&'static str, u64); 34] {
+        let (connection, limits, sessions, store, engine) = (&self.connection, &self.limits, &self.sessions, &self.store, &self.engine);
         [
             ("server.connections_max", self.server.connections_max as u64),
             ("connection.preface_timeout_ms", connection.preface_timeout_ms),
@@ -458,6 +458,11 @@ impl Config {
             ("sessions.bytes_max", sessions.bytes_max as u64),
             ("sessions.ttl_ms", sessions.ttl_ms),
             ("sessions.reap_interval_ms", sessions.reap_interval_ms),
+            ("store.len_max", store.len_max),
+            ("store.bytes_max", store.bytes_max),
+            ("store.cache_bytes", store.cache_bytes as u64),
+            ("store.queue_len_max", store.queue_len_max as u64),
+            ("store.sweep_len", store.sweep_len as u64),
             ("engine.queue_len_max", engine.queue_len_max as u64),
             ("engine.queue_bytes_max", engine.queue_bytes_max as u64),
             ("engine.wait_ms_max", engine.wait_ms_max),

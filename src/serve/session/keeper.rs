@@ -8,7 +8,10 @@ use crate::{
         config::{SessionsConfig, StoreConfig},
         error::ServiceError,
         registry::Registry,
-        store::{Change, Embedded, Ending, Outcome, Place, Store, StoreError, UnixMs, VERSION_LEN, Write, unix_ms},
+        store::{
+            Change, Durability, Embedded, Ending, Options, Outcome, Place, Refused, Store, StoreError, UnixMs, VERSION_LEN, Version, Write,
+            unix_ms,
+        },
     },
 };
 use parking_lot::Mutex;
@@ -57,7 +60,8 @@ impl Keeper {
     /// # Errors
     /// If it cannot be opened.
     pub fn open_store(sessions: &SessionsConfig, config: &StoreConfig) -> Result<Self, KeeperError> {
-        let store = if config.dir.as_os_str().is_empty() { None } else { Some(Arc::new(start(config)?)) };
+        let in_memory = config.dir.as_os_str().is_empty() || config.durability == Durability::Memory;
+        let store = if in_memory { None } else { Some(Arc::new(start(config)?)) };
         Ok(Self {
             table: Arc::new(Sessions::new(sessions.clone(), store.clone())),
             store,
@@ -105,7 +109,7 @@ impl Keeper {
     fn revive(&self, handle: Handle, bytes: &[u8], registry: &Registry) -> Result<Arc<Session>, ServiceError> {
         let kept = read(bytes)?;
         if self.has_expired(&kept) {
-            self.expire(handle, &kept);
+            self.expire(handle, bytes, &kept);
             return Err(ServiceError::SessionExpired);
         }
         let Kept { id, request_id, opened, touched: _, record } = kept;
@@ -133,14 +137,14 @@ impl Keeper {
         }
         let session = self.table.open(opening, Instant::now())?;
         let kept = self.keep(session.opened()?, |_| ()).await;
-        match kept {
+        let error = match kept {
             // Another request of its name has kept it.
-            Ok(Ok(()) | Err(_)) => Ok(session),
-            Err(error) => {
-                self.table.undo(&session);
-                Err(ServiceError::from_store(&error))
-            }
-        }
+            Ok(Ok(()) | Err(Refused::Conflict)) => return Ok(session),
+            Ok(Err(Refused::Full)) => ServiceError::StoreFull,
+            Err(error) => ServiceError::from_store(&error),
+        };
+        self.table.undo(&session);
+        Err(error)
     }
 
     /// A new episode.
@@ -171,7 +175,10 @@ impl Keeper {
         let kept = self.keep(write, move |outcome| its.finish_reset(Some(reset).filter(|_| matches!(outcome, Ok(Ok(())))))).await;
         match kept {
             Ok(Ok(())) => Ok(()),
-            Ok(Err(_)) => Err(ServiceError::SessionNotFound),
+            Ok(Err(refused)) => {
+                session.overtaken(refused);
+                Err(ServiceError::from_refused(refused))
+            }
             Err(error) => Err(ServiceError::from_store(&error)),
         }
     }
@@ -181,12 +188,31 @@ impl Keeper {
     /// # Errors
     /// `SessionNotFound` and its kin; `StoreUnavailable`, after which it may be closed again.
     pub async fn close(&self, id: Uuid, registry: &Registry) -> Result<(), ServiceError> {
-        self.find(id, registry).await?;
-        let session = self.table.close(id, Instant::now())?;
-        if self.store.is_none() {
-            return Ok(());
+        let freed = match self.find(id, registry).await {
+            Ok(_) => self.table.close(id, Instant::now())?.freed(None),
+            // Nobody can go on with it here, and its client may let it go all the same.
+            Err(ServiceError::ModelGone { .. } | ServiceError::StateCorrupt { .. }) => {
+                metrics::counter!("ada_sessions_ended_total", "reason" => "closed").increment(1);
+                Write { handle: Handle::of(id), change: Change::Free { from: None, ending: None, name: None } }
+            }
+            Err(error) => return Err(error),
+        };
+        self.keep(freed, |_| ()).await.map_err(|error| ServiceError::from_store(&error)).map(|_freed| ())
+    }
+
+    /// Whether commits are kept.
+    ///
+    /// # Errors
+    /// Why not.
+    pub fn is_sound(&self) -> Result<(), StoreError> {
+        self.store.as_ref().map_or(Ok(()), |store| store.is_sound())
+    }
+
+    /// Keeps what is on its way, and nothing more. Blocks for that time.
+    pub fn stop(&self) {
+        if let Some(store) = &self.store {
+            store.close();
         }
-        self.keep(session.freed(None), |_| ()).await.map_err(|error| ServiceError::from_store(&error)).map(|_freed| ())
     }
 
     /// Writes, and waits; `then` is called on the writer's thread, whether or not anybody still waits here.
@@ -255,18 +281,23 @@ impl Keeper {
         unix_ms() >= kept.touched.max(self.started).saturating_add(kept.record.ttl_ms)
     }
 
-    fn expire(&self, handle: Handle, kept: &Kept) {
-        let change = Change::Free { ending: Some((Ending::Expired, unix_ms())), name: name_of(&kept.request_id) };
-        if let Some(store) = &self.store {
-            store.submit(Write { handle, change }, |_freed| ());
-            metrics::counter!("ada_sessions_ended_total", "reason" => Ending::Expired.word()).increment(1);
-        }
+    /// Ends one in the store, unless it has gone on meanwhile.
+    fn expire(&self, handle: Handle, bytes: &[u8], kept: &Kept) {
+        let Some(store) = &self.store else { return };
+        let ending = Some((Ending::Expired, unix_ms()));
+        let change = Change::Free { from: Version::of(bytes), ending, name: name_of(&kept.request_id) };
+        store.submit(Write { handle, change }, |freed| {
+            if let Ok(Ok(())) = freed {
+                metrics::counter!("ada_sessions_ended_total", "reason" => Ending::Expired.word()).increment(1);
+            }
+        });
     }
 
     /// Ends what has expired, in memory and, a few at a time, in the store. Blocks for moments.
     pub fn reap(&self) {
         self.table.reap(Instant::now());
         let Some(store) = &self.store else { return };
+        store.upkeep();
         let mut swept = self.swept.lock();
         let Ok(page) = store.home().page(*swept, self.config.sweep_len) else { return };
         *swept = page.last().filter(|_| page.len() == self.config.sweep_len).map(|(handle, _)| *handle);
@@ -275,7 +306,7 @@ impl Keeper {
                 && let Ok(kept) = read(&bytes)
                 && self.has_expired(&kept)
             {
-                self.expire(handle, &kept);
+                self.expire(handle, &bytes, &kept);
             }
         }
         if swept.is_none() {
@@ -287,7 +318,8 @@ impl Keeper {
 }
 
 fn start(config: &StoreConfig) -> Result<Store, KeeperError> {
-    let home = Embedded::open(&config.dir, config.durability, config.cache_bytes);
+    let StoreConfig { dir: _, durability, len_max, bytes_max, cache_bytes, queue_len_max: _, sweep_len: _ } = *config;
+    let home = Embedded::open(&config.dir, Options { durability, cache_bytes, len_max, bytes_max });
     let home = home.map_err(|reason| KeeperError::Store { dir: config.dir.display().to_string(), reason })?;
     Store::start(Arc::new(home), config.queue_len_max).map_err(KeeperError::Thread)
 }

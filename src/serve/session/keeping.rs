@@ -5,7 +5,7 @@ use crate::{
     model::agent::Episode,
     serve::{
         error::ServiceError,
-        store::{Change, Ending, Name, Version, Write, unix_ms},
+        store::{Change, Ending, Name, Refused, Version, Write, unix_ms},
     },
 };
 use sha2::{Digest, Sha256};
@@ -57,10 +57,20 @@ impl Session {
         self.write(Some(reset.from), reset.standing.clone(), reset.episode.clone())
     }
 
-    /// Its end.
+    /// Its end, wherever it stands.
     pub fn freed(&self, ending: Option<Ending>) -> Write {
-        let change = Change::Free { ending: ending.map(|ending| (ending, unix_ms())), name: name_of(&self.request_id) };
+        let ending = ending.map(|ending| (ending, unix_ms()));
+        let change = Change::Free { from: None, ending, name: name_of(&self.request_id) };
         Write { handle: self.handle, change }
+    }
+
+    /// A commit was refused. Where the store knows another one, memory is behind: another server has gone on with the session, or a commit was kept that
+    /// seemed to fail. It leaves memory, so that who asks next finds it as it is kept.
+    pub fn overtaken(&self, refused: Refused) {
+        match refused {
+            Refused::Conflict => self.end(),
+            Refused::Full => {}
+        }
     }
 
     fn write(&self, from: Option<Version>, standing: Standing, episode: Arc<Episode>) -> Result<Write, ServiceError> {

@@ -432,6 +432,11 @@ impl Session {
         !self.slot.lock().used
     }
 
+    /// Whether it has ended: what is left of it knows nothing any more.
+    fn is_over(&self) -> bool {
+        self.slot.lock().ended
+    }
+
     /// When it was last touched, if no act is in flight.
     fn idle_since(&self) -> Option<Instant> {
         let slot = self.slot.lock();

@@ -186,6 +186,11 @@ impl Sessions {
         let handle = Handle::of(id);
         let mut shard = self.shard(handle).lock();
         if let Some(session) = shard.live.get(&handle).cloned() {
+            if session.is_over() {
+                // Overtaken: it is to be found in the store.
+                self.remove(&mut shard, handle);
+                return Err(ServiceError::SessionNotFound);
+            }
             if session.end_if_idle(session.ttl, now) {
                 self.bury(&mut shard, handle, Ending::Expired, now);
                 return Err(ServiceError::SessionExpired);
@@ -227,7 +232,7 @@ impl Sessions {
 
     /// One that is in memory, as it is.
     pub fn live(&self, handle: Handle) -> Option<Arc<Session>> {
-        self.shard(handle).lock().live.get(&handle).cloned()
+        self.shard(handle).lock().live.get(&handle).filter(|session| !session.is_over()).cloned()
     }
 
     /// Up to `len` sessions with handles above `after`, in order of handle.
@@ -266,7 +271,7 @@ impl Sessions {
         if self.evict_unused(now) {
             return Ok(());
         }
-        let idle_min = Duration::from_millis(self.config.evict_idle_ms);
+        let idle_min = self.evict_idle();
         for _ in 0..LOOKS_MAX {
             let Some((filed, handle)) = self.idle.lock().first(idle_min, now) else { break };
             let mut shard = self.shard(handle).lock();
@@ -289,7 +294,7 @@ impl Sessions {
     /// Evicts the oldest of those that nobody has asked for; says whether there was one. Whoever opens without end takes places from its own
     /// like.
     fn evict_unused(&self, now: Instant) -> bool {
-        let idle_min = Duration::from_millis(self.config.unused_idle_ms.min(self.config.evict_idle_ms));
+        let idle_min = Duration::from_millis(self.config.unused_idle_ms).min(self.evict_idle());
         for _ in 0..LOOKS_MAX {
             let Some((_, handle)) = self.unused.lock().first(idle_min, now) else { break };
             let mut shard = self.shard(handle).lock();
@@ -304,6 +309,11 @@ impl Sessions {
         false
     }
 
+    /// Who comes back from the store loses nothing by leaving memory.
+    fn evict_idle(&self) -> Duration {
+        if self.store.is_some() { Duration::ZERO } else { Duration::from_millis(self.config.evict_idle_ms) }
+    }
+
     /// Whether nobody is about to use a session that will come back from the store as another value: to be asked with its shard locked, and one hold of
     /// one's own on it.
     fn is_ours(&self, session: &Arc<Session>) -> bool {
@@ -315,6 +325,11 @@ impl Sessions {
         if self.store.is_none() {
             return self.bury(shard, handle, Ending::Evicted, now);
         }
+        self.remove(shard, handle);
+    }
+
+    /// It is in the store alone.
+    fn remove(&self, shard: &mut Shard, handle: Handle) {
         if let Some(session) = shard.live.remove(&handle) {
             self.forget(&session);
             metrics::counter!("ada_sessions_spilled_total").increment(1);

@@ -7,7 +7,7 @@
 mod embedded;
 mod writer;
 
-pub use embedded::{Durability, Embedded};
+pub use embedded::{Embedded, Options};
 pub use writer::{Outcome, Store};
 
 use crate::serve::session::Handle;
@@ -47,6 +47,18 @@ impl Version {
     }
 }
 
+/// What a commit survives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Durability {
+    /// Nothing: sessions are in memory alone.
+    Memory,
+    /// The end of the process, however sudden: the system has it.
+    Process,
+    /// The end of the machine: the disk has it.
+    Power,
+}
+
 /// How a session ended without its client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ending {
@@ -70,6 +82,8 @@ pub enum Change {
     },
     /// It is free, and the ending is remembered if there is one.
     Free {
+        /// What is freed; None: whatever is there.
+        from: Option<Version>,
         /// How it ended; None: its client has closed it.
         ending: Option<(Ending, UnixMs)>,
         /// The name of the request that opened it.
@@ -108,9 +122,14 @@ pub enum Place {
     Empty,
 }
 
-/// Another writer was there: what is kept is not what the write goes on from.
+/// Why one write was not made, beside others that were.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Conflict;
+pub enum Refused {
+    /// Another writer was there: what is kept is not what the write goes on from.
+    Conflict,
+    /// There is no room for one session more.
+    Full,
+}
 
 /// Why nothing could be kept.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -125,12 +144,12 @@ pub enum StoreError {
 
 /// A place where bytes of sessions are kept. Calls block; they come from threads that may.
 pub trait Home: Send + Sync + 'static {
-    /// Makes all these changes that meet what they go on from, together or not at all; the answer of each. On an error none is made, or, where the home
-    /// was lost in the middle, all of them may be.
+    /// Makes all these changes that meet what they go on from and find room, together or not at all; the answer of each. On an error none is made, or,
+    /// where the home was lost in the middle, all of them may be.
     ///
     /// # Errors
     /// If nothing could be written.
-    fn write(&self, writes: &[Write]) -> Result<Vec<Result<(), Conflict>>, StoreError>;
+    fn write(&self, writes: &[Write]) -> Result<Vec<Result<(), Refused>>, StoreError>;
 
     /// What there is of a session.
     ///
@@ -156,11 +175,17 @@ pub trait Home: Send + Sync + 'static {
     /// If nothing could be written.
     fn forget_endings(&self, before: UnixMs) -> Result<usize, StoreError>;
 
-    /// Sessions, and the bytes that they and their upkeep take.
+    /// How much there is.
     ///
     /// # Errors
     /// If nothing could be read.
     fn size(&self) -> Result<Size, StoreError>;
+
+    /// Finds out whether there is room again and it works: writes more than any commit does, and takes it back.
+    ///
+    /// # Errors
+    /// If it could not be written.
+    fn probe(&self) -> Result<(), StoreError>;
 }
 
 /// How much a home holds.
@@ -168,8 +193,10 @@ pub trait Home: Send + Sync + 'static {
 pub struct Size {
     /// Sessions.
     pub sessions: u64,
-    /// Bytes of the medium.
+    /// Bytes of their records.
     pub bytes: u64,
+    /// Bytes of the medium, which keeps what was freed for what comes.
+    pub medium_bytes: u64,
 }
 
 impl Ending {

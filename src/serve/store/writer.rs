@@ -1,27 +1,31 @@
 //! One thread that writes: what arrives while it is at work goes into its next transaction (group commit).
 
-use super::{Conflict, Home, Place, StoreError, Write};
+use super::{Home, Place, Refused, Size, StoreError, Write};
 use crate::serve::session::Handle;
 use parking_lot::{Condvar, Mutex};
 use std::{
     collections::VecDeque,
     io,
     sync::Arc,
-    thread::{Builder, JoinHandle},
-    time::Instant,
+    thread::{self, Builder, JoinHandle},
+    time::{Duration, Instant},
 };
 
 /// Writes of one transaction: more than the acts of any tick, and few enough that the first one does not wait for long.
 const GROUP_MAX: usize = 256;
 
+/// A transaction that takes longer is a sign that the disk is gone.
+const PATIENCE: Duration = Duration::from_secs(5);
+
 /// What became of a write.
-pub type Outcome = Result<Result<(), Conflict>, StoreError>;
+pub type Outcome = Result<Result<(), Refused>, StoreError>;
 
 type Told = Box<dyn FnOnce(Outcome) + Send>;
 
 struct Queue {
     waiting: Mutex<Waiting>,
     arrived: Condvar,
+    health: Mutex<Health>,
 }
 
 #[derive(Default)]
@@ -30,12 +34,21 @@ struct Waiting {
     closed: bool,
 }
 
+/// How the home does.
+#[derive(Default)]
+struct Health {
+    /// Since when it works on one transaction.
+    busy_since: Option<Instant>,
+    /// What it said last, if that was no good; until a probe has shown that there is room again.
+    failed: Option<StoreError>,
+}
+
 /// A home and the thread that writes to it. Dropping it writes what still waits.
 pub struct Store {
     home: Arc<dyn Home>,
     queue: Arc<Queue>,
     len_max: usize,
-    thread: Option<JoinHandle<()>>,
+    thread: Mutex<Option<JoinHandle<()>>>,
 }
 
 impl Store {
@@ -44,10 +57,10 @@ impl Store {
     /// # Errors
     /// If the system gives no thread.
     pub fn start(home: Arc<dyn Home>, len_max: usize) -> io::Result<Self> {
-        let queue = Arc::new(Queue { waiting: Mutex::default(), arrived: Condvar::new() });
+        let queue = Arc::new(Queue { waiting: Mutex::default(), arrived: Condvar::new(), health: Mutex::default() });
         let (its_home, its_queue) = (home.clone(), queue.clone());
         let thread = Builder::new().name("ada-store".into()).spawn(move || run(&*its_home, &its_queue))?;
-        Ok(Self { home, queue, len_max, thread: Some(thread) })
+        Ok(Self { home, queue, len_max, thread: Mutex::new(Some(thread)) })
     }
 
     /// Writes, and tells what became of it: from the writer's thread, in the order of submission, or at once where too many wait. One that is dropped untold
@@ -73,7 +86,10 @@ impl Store {
         let begin = Instant::now();
         let read = self.home.read(handle);
         metrics::histogram!("ada_store_op_duration_seconds", "op" => "read").record(begin.elapsed().as_secs_f64());
-        read.inspect_err(|_| metrics::counter!("ada_store_errors_total").increment(1))
+        read.inspect_err(|error| {
+            metrics::counter!("ada_store_errors_total").increment(1);
+            self.queue.health.lock().failed = Some(error.clone());
+        })
     }
 
     /// The home, for what is done beside acts.
@@ -85,15 +101,49 @@ impl Store {
     pub fn waiting(&self) -> usize {
         self.queue.waiting.lock().writes.len()
     }
+
+    /// Whether it keeps what it is given, as far as the last writes tell.
+    ///
+    /// # Errors
+    /// Why not.
+    pub fn is_sound(&self) -> Result<(), StoreError> {
+        let health = self.queue.health.lock();
+        match health.busy_since.map(|since| since.elapsed()) {
+            Some(busy) if busy > PATIENCE => Err(StoreError::Unavailable(format!("a commit takes longer than {} s", PATIENCE.as_secs()))),
+            _ => health.failed.clone().map_or(Ok(()), Err),
+        }
+    }
+
+    /// House-keeping: after a failure it finds out whether the home is well again. Blocks.
+    pub fn upkeep(&self) {
+        let failed = self.queue.health.lock().failed.is_some();
+        if failed && self.home.probe().is_ok() {
+            self.queue.health.lock().failed = None;
+            tracing::info!("the store is well again");
+        }
+        if let Ok(Size { sessions, bytes, medium_bytes }) = self.home.size() {
+            metrics::gauge!("ada_store_sessions").set(sessions as f64);
+            metrics::gauge!("ada_store_bytes").set(bytes as f64);
+            metrics::gauge!("ada_store_medium_bytes").set(medium_bytes as f64);
+        }
+    }
+
+    /// Writes what still waits, and takes nothing more. Blocks for that time.
+    pub fn close(&self) {
+        self.queue.waiting.lock().closed = true;
+        self.queue.arrived.notify_one();
+        let thread = self.thread.lock().take();
+        // Whoever is told may be the last who holds the store.
+        let ended = thread.filter(|thread| thread.thread().id() != thread::current().id()).map(JoinHandle::join);
+        if ended.is_some_and(|ended| ended.is_err()) {
+            tracing::error!("the store's thread ended by panic");
+        }
+    }
 }
 
 impl Drop for Store {
     fn drop(&mut self) {
-        self.queue.waiting.lock().closed = true;
-        self.queue.arrived.notify_one();
-        if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
-            tracing::error!("the store's thread ended by panic");
-        }
+        self.close();
     }
 }
 
@@ -111,17 +161,28 @@ fn run(home: &dyn Home, queue: &Queue) {
             waiting.writes.drain(..count).unzip()
         };
         let begin = Instant::now();
+        queue.health.lock().busy_since = Some(begin);
         let outcome = home.write(&writes);
+        queue.health.lock().ended(&outcome);
         metrics::histogram!("ada_store_op_duration_seconds", "op" => "write").record(begin.elapsed().as_secs_f64());
         metrics::histogram!("ada_store_group_size").record(writes.len() as f64);
         tell(outcome, told.into_iter());
     }
 }
 
-fn tell(outcome: Result<Vec<Result<(), Conflict>>, StoreError>, told: impl Iterator<Item = Told>) {
+impl Health {
+    fn ended<T>(&mut self, outcome: &Result<T, StoreError>) {
+        self.busy_since = None;
+        if let Err(error) = outcome {
+            self.failed = Some(error.clone());
+        }
+    }
+}
+
+fn tell(outcome: Result<Vec<Result<(), Refused>>, StoreError>, told: impl Iterator<Item = Told>) {
     match outcome {
         Ok(outcomes) => {
-            let conflicts = outcomes.iter().filter(|outcome| outcome.is_err()).count();
+            let conflicts = outcomes.iter().filter(|outcome| **outcome == Err(Refused::Conflict)).count();
             metrics::counter!("ada_store_cas_conflicts_total").increment(conflicts as u64);
             told.zip(outcomes).for_each(|(told, outcome)| told(Ok(outcome)));
         }
