@@ -5,7 +5,7 @@ use std::{ffi::OsString, os::unix::ffi::OsStringExt};
 use toml::Value;
 
 /// Another legal value for keys whose text is one of a few words.
-const OTHER_WORDS: [(&str, &str); 2] = [("models.weights", "bf16"), ("telemetry.format", "json")];
+const OTHER_WORDS: [(&str, &str); 3] = [("models.weights", "bf16"), ("telemetry.format", "json"), ("store.durability", "power")];
 /// For any other text: an address, a path, a name.
 const OTHER_TEXT: &str = "127.0.0.1:1";
 
