@@ -9,6 +9,7 @@ mod frames;
 mod generator;
 mod history;
 mod hold;
+mod kills;
 mod late;
 mod lifecycle;
 mod limits;
