@@ -327,3 +327,7 @@ fn start(config: &StoreConfig) -> Result<Store, KeeperError> {
 fn read(bytes: &[u8]) -> Result<Kept, ServiceError> {
     Kept::read(bytes.get(VERSION_LEN..).unwrap_or_default()).map_err(|error| ServiceError::corrupt(&error))
 }
+
+#[cfg(test)]
+#[path = "keeper_tests.rs"]
+mod tests;

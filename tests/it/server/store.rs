@@ -32,6 +32,13 @@ async fn start_with(dir: &Path, settings: &[&str]) -> (Process, Running) {
     start_process(&[&[store.as_str()], settings].concat()).await
 }
 
+/// Ends a server as a user does.
+fn end(mut process: Process) {
+    let pid = process.0.id().to_string();
+    assert!(Command::new("kill").args(["-TERM", &pid]).status().unwrap().success());
+    process.0.wait().unwrap();
+}
+
 /// The future of a session of its own that nobody disturbs.
 async fn undisturbed(steps: u64) -> Vec<Vec<u32>> {
     let server = start(|_| {}).await;
@@ -177,4 +184,53 @@ async fn a_checkpoint_that_is_gone_is_named() {
     drop(other);
     let (_process, server) = start_with(dir.path(), &[]).await;
     answer(&server, &id, 1).await;
+}
+
+/// A record that is damaged costs its own session: that one says so, whoever asks, and can be closed; all others go on.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_damaged_record_costs_its_own_session() {
+    let expected = undisturbed(2).await;
+    let dir = tempfile::tempdir().unwrap();
+    let (process, server) = start_with(dir.path(), &[]).await;
+    let (damaged, sound) = (open(&server, "").await.session_id, open(&server, "").await.session_id);
+    for id in [&damaged, &sound] {
+        answer(&server, id, 1).await;
+    }
+    end(process);
+    let file = dir.path().join("sessions.redb");
+    let mut bytes = fs::read(&file).unwrap();
+    let id = *uuid::Uuid::parse_str(&damaged).unwrap().as_bytes();
+    let places: Vec<_> = bytes.windows(id.len()).enumerate().filter(|(_, window)| *window == id).map(|(at, _)| at).collect();
+    assert!(!places.is_empty());
+    places.iter().for_each(|at| bytes[at + 40] ^= 1);
+    fs::write(&file, bytes).unwrap();
+
+    let (_process, server) = start_with(dir.path(), &[]).await;
+    let refused = server.agent().await.act(asked(&damaged, 2)).await.unwrap_err();
+    assert_eq!(failure(&refused), (Code::DataLoss, "STATE_CORRUPT".into()), "{refused:?}");
+    let reply = server.get(&format!("/v1/sessions/{damaged}")).await;
+    assert_eq!((reply.status, reply.reason().as_str()), (500, "STATE_CORRUPT"), "{reply:?}");
+    assert_eq!(bits(&answer(&server, &sound, 2).await), expected[1]);
+    assert_eq!(server.get("/readyz").await.status, 200);
+    let close = || async { server.agent().await.close_session(pb::CloseSessionRequest { session_id: damaged.clone() }).await };
+    close().await.unwrap();
+    assert_eq!(failure(&close().await.unwrap_err()).1, "SESSION_NOT_FOUND");
+}
+
+/// A store that is full takes no session more; those that are there go on, and one that is closed makes room.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_full_store_takes_no_session_more() {
+    let dir = tempfile::tempdir().unwrap();
+    let (_process, server) = start_with(dir.path(), &["store.len_max=2"]).await;
+    let ids = [open(&server, "").await.session_id, open(&server, "").await.session_id];
+    let refused = server.agent().await.open_session(pb::OpenSessionRequest::default()).await.unwrap_err();
+    assert_eq!(failure(&refused), (Code::ResourceExhausted, "STORE_FULL".into()));
+    let reply = server.post("/v1/sessions", &json!({})).await;
+    assert_eq!((reply.status, reply.reason().as_str()), (507, "STORE_FULL"));
+    for id in &ids {
+        answer(&server, id, 1).await;
+    }
+    server.agent().await.close_session(pb::CloseSessionRequest { session_id: ids[0].clone() }).await.unwrap();
+    open(&server, "").await;
+    assert_eq!(server.get("/v1/sessions").await.json()["sessions"].as_array().unwrap().len(), 2);
 }

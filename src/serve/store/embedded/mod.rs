@@ -167,6 +167,9 @@ fn refused(error: redb::Error) -> StoreError {
         {
             StoreError::Full(error.to_string())
         }
+        redb::Error::Corrupted(what) => StoreError::Unavailable(format!(
+            "its file is damaged ({what}). Nothing was changed: bring a copy back in its place, or move it away to begin without sessions"
+        )),
         error => StoreError::Unavailable(error.to_string()),
     }
 }

@@ -1,5 +1,5 @@
 use super::*;
-use crate::serve::store::VERSION_LEN;
+use crate::serve::store::{Store, VERSION_LEN};
 use redb::StorageBackend;
 use uuid::Uuid;
 
@@ -95,11 +95,12 @@ enum Op {
     Sync,
 }
 
-/// A medium in memory that notes what it is told.
+/// A medium in memory that notes what it is told, and has no room while it is full.
 #[derive(Clone, Debug, Default)]
 struct Noted {
     image: Arc<Mutex<Vec<u8>>>,
     ops: Arc<Mutex<Vec<Op>>>,
+    is_full: Arc<AtomicBool>,
 }
 
 impl StorageBackend for Noted {
@@ -127,13 +128,16 @@ impl StorageBackend for Noted {
 
 impl Noted {
     fn note(&self, op: Op) -> io::Result<()> {
+        if self.is_full.load(Ordering::Relaxed) {
+            return Err(io::ErrorKind::StorageFull.into());
+        }
         apply(&mut self.image.lock(), &op);
         self.ops.lock().push(op);
         Ok(())
     }
 
     fn of(image: Vec<u8>) -> Self {
-        Self { image: Arc::new(Mutex::new(image)), ops: Arc::default() }
+        Self { image: Arc::new(Mutex::new(image)), ..Self::default() }
     }
 
     fn home(&self) -> Result<Embedded, StoreError> {
@@ -198,4 +202,80 @@ fn what_is_acknowledged_outlives_the_power() {
         }
     }
     assert!(looked > 400, "{looked}");
+}
+
+/// A session more is refused where there is no room, those that are there go on, and one that leaves makes room.
+#[test]
+fn sessions_are_bounded_in_number_and_in_bytes() {
+    let dir = tempfile::tempdir().unwrap();
+    let few = Options { len_max: 2, ..OPTIONS };
+    let home = Embedded::open(dir.path(), few).unwrap();
+    let outcomes = home.write(&[keep(1, None, 0, 50), keep(2, None, 0, 50), keep(3, None, 0, 50), keep(1, Some(0), 1, 90)]);
+    assert_eq!(outcomes, Ok(vec![Ok(()), Ok(()), Err(Refused::Full), Ok(())]));
+    let free = |i, from: Option<u64>| Write { handle: handle(i), change: Change::Free { from: from.map(at), ending: None, name: None } };
+    // What has gone on meanwhile is not freed.
+    assert_eq!(home.write(&[free(1, Some(0)), keep(3, None, 0, 50)]), Ok(vec![Err(Refused::Conflict), Err(Refused::Full)]));
+    assert_eq!(home.write(&[free(1, Some(1)), keep(3, None, 0, 50)]), Ok(vec![Ok(()), Ok(())]));
+    assert_eq!((step_of(&home, 1), step_of(&home, 3)), (None, Some(0)));
+    let bytes = |records: u64| records * (50 + VERSION_LEN as u64);
+    assert_eq!((home.size().unwrap().sessions, home.size().unwrap().bytes), (2, bytes(2)));
+    drop(home);
+    // Bytes are counted over restarts.
+    let home = Embedded::open(dir.path(), Options { bytes_max: 8 << 20, ..OPTIONS }).unwrap();
+    assert_eq!(home.size().unwrap().bytes, bytes(2));
+    let mut refused = None;
+    for i in 10..4_000 {
+        if let Err(Refused::Full) = home.write(&[keep(i, None, 0, 9_000)]).unwrap()[0] {
+            refused = Some(i);
+            break;
+        }
+    }
+    let held = home.size().unwrap();
+    assert!(refused.is_some() && held.bytes * SPREAD <= 8 << 20 && (held.bytes + 10_000) * SPREAD > 8 << 20, "{held:?}");
+    for step in 0..200 {
+        assert_eq!(home.write(&[keep(10, Some(step), step + 1, 9_000)]), Ok(vec![Ok(())]), "those that are there go on");
+    }
+    assert!(home.size().unwrap().medium_bytes <= 8 << 20);
+}
+
+/// Without room nothing is acknowledged; once there is room it goes on from what was acknowledged, without a restart.
+#[test]
+fn room_that_comes_back_is_found() {
+    let medium = Noted::default();
+    let home = Arc::new(medium.home().unwrap());
+    let store = Store::start(home.clone(), 10).unwrap();
+    let write = |write: Write| {
+        let (told, outcome) = std::sync::mpsc::channel();
+        store.submit(write, move |outcome| told.send(outcome).unwrap());
+        outcome.recv().unwrap()
+    };
+    assert_eq!((write(keep(1, None, 0, 9_000)), store.is_sound()), (Ok(Ok(())), Ok(())));
+    medium.is_full.store(true, Ordering::Relaxed);
+    for _ in 0..3 {
+        assert!(matches!(write(keep(1, Some(0), 1, 9_000)), Err(StoreError::Full(_))));
+    }
+    assert!(matches!(store.is_sound(), Err(StoreError::Full(_))));
+    store.upkeep();
+    assert!(store.is_sound().is_err(), "it is full still");
+    medium.is_full.store(false, Ordering::Relaxed);
+    std::thread::sleep(REST);
+    store.upkeep();
+    assert_eq!(store.is_sound(), Ok(()));
+    assert_eq!((write(keep(1, Some(0), 1, 9_000)), step_of(&home, 1)), (Ok(Ok(())), Some(1)));
+}
+
+/// What waits is written when the store closes, and what comes later is refused.
+#[test]
+fn what_waits_is_written() {
+    let medium = Noted::default();
+    let home = Arc::new(medium.home().unwrap());
+    let store = Store::start(home.clone(), 1_000).unwrap();
+    for i in 0..300 {
+        store.submit(keep(i, None, 0, 90), |outcome| assert_eq!(outcome, Ok(Ok(()))));
+    }
+    store.close();
+    assert_eq!(home.size().unwrap().sessions, 300);
+    let (told, outcome) = std::sync::mpsc::channel();
+    store.submit(keep(900, None, 0, 90), move |outcome| told.send(outcome).unwrap());
+    assert!(matches!(outcome.recv().unwrap(), Err(StoreError::Unavailable(_))));
 }
