@@ -225,6 +225,7 @@ impl ServiceError {
     pub fn corrupt(cause: &dyn std::fmt::Display) -> Self {
         let id = Uuid::new_v4();
         tracing::error!(%id, %cause, "a stored session is damaged");
+        metrics::counter!("ada_state_corrupt_total").increment(1);
         Self::StateCorrupt { id }
     }
 

@@ -13,6 +13,7 @@ pub mod grpc;
 pub mod guard;
 pub mod http;
 pub mod idle;
+mod keeper;
 pub mod listener;
 pub mod options;
 pub mod registry;

@@ -8,12 +8,11 @@ use crate::{
         engine::{Engine, EngineOptions, Failure, Job, Patience, Question, Refusal},
         error::{ServiceError, Stage},
         idle::{Idle, until_idle},
+        keeper::{Keeper, KeeperError},
         registry::{Model, Registry, RegistryError},
         request::{ActRequest, ActResult, Acted, ForkRequest, ImportRequest, ListRequest, OpenRequest, Opened, Page, ResetRequest},
         seat::{RETRY_AFTER_RESTART_MS, Seat},
-        session::{
-            Answer, Entry, Handle, Keeper, KeeperError, Opening, Record, Session, Standing, Summary, Untold, Waiter, is_request_id, key_of,
-        },
+        session::{Answer, Entry, Handle, Opening, Record, Session, Standing, Summary, Untold, Waiter, is_request_id, key_of},
         telemetry,
     },
 };
@@ -149,6 +148,9 @@ impl Service {
         metrics::gauge!("ada_queue_depth").set(waiting as f64);
         metrics::gauge!("ada_inflight_acts").set(running as f64);
         metrics::gauge!("ada_queue_wait_estimate_seconds").set(self.engine.expected_wait().as_secs_f64());
+        if let Some(store) = self.keeper.store() {
+            metrics::gauge!("ada_store_queue_depth").set(store.waiting() as f64);
+        }
         let table = self.keeper.table();
         metrics::gauge!("ada_sessions").set(table.len() as f64);
         metrics::gauge!("ada_session_state_bytes").set(table.bytes() as f64);

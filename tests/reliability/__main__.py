@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from . import held, hostile, log, memory, newcomer, overload, schema, speed
+from . import held, hostile, log, memory, newcomer, overload, schema, speed, store
 from .process import EXTRA, RELEASE, Row
 
 SCENARIOS: dict[str, Callable[[], Iterator[Row]]] = {
@@ -21,6 +21,7 @@ SCENARIOS: dict[str, Callable[[], Iterator[Row]]] = {
     "schema": schema.measure,
     "overload": overload.measure,
     "speed": speed.measure,
+    "store": store.measure,
 }
 
 

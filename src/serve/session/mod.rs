@@ -2,7 +2,6 @@
 
 mod flight;
 mod handle;
-mod keeper;
 mod keeping;
 mod key;
 mod record;
@@ -11,7 +10,6 @@ mod untold;
 
 pub use flight::{Flight, Waiter};
 pub use handle::Handle;
-pub use keeper::{Keeper, KeeperError};
 pub use keeping::name_of;
 pub use key::{Key, key_of};
 pub use record::{Kept, Last, Record, Unreadable};

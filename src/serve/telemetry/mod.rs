@@ -36,7 +36,7 @@ pub enum Kind {
 use Kind::{Counter, Gauge, Histogram};
 
 /// Every metric: name, kind, meaning.
-pub const CATALOGUE: [(&str, Kind, &str); 35] = [
+pub const CATALOGUE: [(&str, Kind, &str); 47] = [
     ("ada_build_info", Gauge, "1, labelled by version"),
     ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
     ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
@@ -65,14 +65,26 @@ pub const CATALOGUE: [(&str, Kind, &str); 35] = [
     ("ada_cancelled_total", Counter, "acts that nobody waited for any more, by stage"),
     ("ada_replays_total", Counter, "acts answered without computing, by source: memory or inflight"),
     ("ada_step_conflicts_total", Counter, "acts refused for their step, by reason"),
-    ("ada_sessions", Gauge, "live sessions"),
-    ("ada_session_state_bytes", Gauge, "memory of all episodes"),
+    ("ada_sessions", Gauge, "sessions in memory"),
+    ("ada_session_state_bytes", Gauge, "memory of their episodes"),
     ("ada_sessions_created_total", Counter, "sessions opened"),
     (
         "ada_sessions_ended_total",
         Counter,
         "sessions ended, by reason: closed, expired, evicted, undone (nobody took the answer of the open)",
     ),
+    ("ada_sessions_spilled_total", Counter, "sessions that left memory for the store alone"),
+    ("ada_sessions_revived_total", Counter, "sessions that came back from the store"),
+    ("ada_store_sessions", Gauge, "sessions that the store keeps, those in memory among them"),
+    ("ada_store_bytes", Gauge, "bytes of their records"),
+    ("ada_store_medium_bytes", Gauge, "bytes of the store's file"),
+    ("ada_store_queue_depth", Gauge, "commits that wait for the store"),
+    ("ada_store_group_size", Histogram, "commits that share one transaction of the store"),
+    ("ada_store_op_duration_seconds", Histogram, "time of the store, by operation: read, write (a transaction)"),
+    ("ada_store_errors_total", Counter, "transactions and reads of the store that failed"),
+    ("ada_store_cas_conflicts_total", Counter, "commits refused because the store had gone on"),
+    ("ada_state_corrupt_total", Counter, "records that were found damaged"),
+    ("ada_recovery_duration_seconds", Histogram, "time to open the store, after a kill too"),
     ("ada_engine_panics_total", Counter, "panics caught in the engine"),
     ("ada_log_lines_left_out_total", Counter, "log lines that could not be written, or repeated a message too often, by reason"),
     ("ada_nonfinite_total", Counter, "non-finite network outputs, by place"),
@@ -137,6 +149,7 @@ pub fn install_metrics() -> PrometheusHandle {
                 .set_buckets(&LATENCY_BUCKETS)
                 .and_then(|builder| builder.set_buckets_for_metric(Matcher::Full("ada_batch_size".to_owned()), &COUNT_BUCKETS))
                 .and_then(|builder| builder.set_buckets_for_metric(Matcher::Full("ada_act_network_evaluations".to_owned()), &COUNT_BUCKETS))
+                .and_then(|builder| builder.set_buckets_for_metric(Matcher::Full("ada_store_group_size".to_owned()), &COUNT_BUCKETS))
                 .expect("bucket lists are not empty, or it is a bug")
                 .build_recorder();
             let handle = recorder.handle();

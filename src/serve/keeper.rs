@@ -1,13 +1,13 @@
 //! Sessions wherever they are: in memory, and in the store behind it. What changes one of them is kept before it is told; one that is not in memory comes
 //! back when somebody asks for it.
 
-use super::{Handle, Kept, Opening, Session, Sessions, Summary, name_of};
 use crate::{
     model::agent::Episode,
     serve::{
         config::{SessionsConfig, StoreConfig},
         error::ServiceError,
         registry::Registry,
+        session::{Handle, Kept, Opening, Session, Sessions, Summary, name_of},
         store::{
             Change, Durability, Embedded, Ending, Options, Outcome, Place, Refused, Store, StoreError, UnixMs, VERSION_LEN, Version, Write,
             unix_ms,
