@@ -51,7 +51,13 @@ reliability: build venv reliability-tools ## The figures of docs/reliability.md:
 	cargo build $(CARGO_FLAGS) --examples
 	$(BIN)/python -m tests.reliability $(RELIABILITY)
 
-.PHONY: reliability-tools
+KILLS ?= 100
+DURABILITY ?= process
+chaos: ## Kills servers while sessions act, and looks for acts that are lost or given twice: make chaos KILLS=1000 DURABILITY=power
+	cargo build $(CARGO_FLAGS) --bins --example chaos
+	target/release/examples/chaos --kills $(KILLS) --durability $(DURABILITY)
+
+.PHONY: chaos reliability-tools
 reliability-tools: .venv-reliability/.ready
 .venv-reliability/.ready: tests/reliability/requirements.txt | tools
 	$(PYTHON) -m venv .venv-reliability

@@ -21,8 +21,8 @@
 //! # One request, followed by hand
 //! 1. Bytes arrive at [`serve::listener`], if their connection has a place ([`serve::connections`]) and the request may come from where it
 //!    says ([`serve::guard`]); [`serve::grpc`] or [`serve::http`] turns them into a request of the core and checks them.
-//! 2. [`serve::session`] compares the step with the committed one: a retry is answered from memory, a wrong step refused; otherwise the
-//!    episode, an immutable value ([`model::agent::Episode`]), is leased.
+//! 2. `serve/keeper.rs` finds the session, in memory or in the [`serve::store`] behind it; [`serve::session`] compares the step with the committed
+//!    one: a retry is answered from memory, a wrong step refused; otherwise the episode, an immutable value ([`model::agent::Episode`]), is leased.
 //! 3. [`model::agent::Agent::begin`] checks the observation and makes a [`model::agent::Act`]: a small program that asks networks
 //!    ([`model::agent::Ask`]) while its window goes down the table of noise levels ([`model::diffusion::schedule`]).
 //! 4. [`serve::engine`], earliest deadline first, calls [`model::agent::Agent::advance`] on all acts in flight: what they ask is answered
@@ -31,7 +31,7 @@
 //!    window itself (zig-zag), and the denoiser ([`model::denoiser`]) takes every window one row down ([`model::diffusion::descent`]), led by a guide
 //!    where it is asked to be ([`model::diffusion::guidance`]). Of a plan of states inverse dynamics ([`model::head`]) make actions.
 //! 5. A finished act is a new episode and a [`model::agent::Chunk`]; the session commits both together, if the step is still the
-//!    same, and the answer goes out.
+//!    same: into the store, where there is one, then in memory. Then the answer goes out.
 //!
 //! What a model is stands in one struct, [`model::method::Method`], word for word the same in a recipe and in a checkpoint; each choice is a
 //! closed enum. [`model::check`] is the one check of it, for recipes, checkpoints and sessions.
@@ -64,6 +64,7 @@
 //! | what was executed, as tokens; a history that outlasts an episode, or is brought along | `model/agent/executed.rs`, [`model::agent::Agent::recall`] |
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
 //! | a session as bytes; an episode that was written down, taken up again | [`serve::session::Record`], [`model::agent::Agent::adopt`] |
+//! | a session that outlives the process: what is written, when, and where | `serve/session/keeping.rs`, `serve/keeper.rs`, [`serve::store`] |
 //! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |
 //!
 //! # Paper and code

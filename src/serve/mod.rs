@@ -1,7 +1,8 @@
 //! How checkpoints are used: gRPC and REST over one core, on one port.
 //!
-//! The way of a request: [`listener`] (bytes, by way of `wire`) -> [`guard`] (whom it may come from) -> [`grpc`] or [`http`] (convert) -> [`service`] (verbs) -> [`session`] (lease the episode) -> [`engine`]
-//! (queue, batch, network evaluations) -> [`session`] (commit) -> bytes.
+//! The way of a request: [`listener`] (bytes, by way of `wire`) -> [`guard`] (whom it may come from) -> [`grpc`] or [`http`] (convert) -> [`service`] (verbs) -> `keeper` (find
+//! the session) -> [`session`] (lease the episode) -> [`engine`] (queue, batch, network evaluations) -> [`store`] (keep it) -> [`session`] (commit)
+//! -> bytes.
 
 pub mod config;
 pub mod connections;

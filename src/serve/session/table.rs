@@ -280,7 +280,7 @@ impl Sessions {
                 continue;
             };
             let since = session.idle_since().unwrap_or(now);
-            if since == filed && self.is_ours(&session) && session.end_if_idle(idle_min, now) {
+            if self.is_first(filed, since, now) && self.is_ours(&session) && session.end_if_idle(idle_min, now) {
                 self.make_go(&mut shard, handle, now);
                 return Ok(());
             }
@@ -294,7 +294,7 @@ impl Sessions {
     /// Evicts the oldest of those that nobody has asked for; says whether there was one. Whoever opens without end takes places from its own
     /// like.
     fn evict_unused(&self, now: Instant) -> bool {
-        let idle_min = Duration::from_millis(self.config.unused_idle_ms).min(self.evict_idle());
+        let idle_min = Duration::from_millis(self.config.unused_idle_ms.min(self.config.evict_idle_ms));
         for _ in 0..LOOKS_MAX {
             let Some((_, handle)) = self.unused.lock().first(idle_min, now) else { break };
             let mut shard = self.shard(handle).lock();
@@ -307,6 +307,13 @@ impl Sessions {
             self.unused.lock().forget(handle);
         }
         false
+    }
+
+    /// Whether one that is filed as idle since `filed`, and was touched at `since`, is to go before those behind it. Where it comes back it need not be the very
+    /// first, and sessions that were all touched a moment after they were filed are not looked at one by one.
+    fn is_first(&self, filed: Instant, since: Instant, now: Instant) -> bool {
+        let [filed_for, idle_for] = [filed, since].map(|time| now.saturating_duration_since(time));
+        since == filed || self.store.is_some() && idle_for * 2 >= filed_for
     }
 
     /// Who comes back from the store loses nothing by leaving memory.

@@ -140,6 +140,29 @@ async fn idle_sessions_leave_memory_and_come_back() {
     assert_eq!(server.get(&format!("/v1/sessions?page_size=100&page_token={token}")).await.json()["sessions"].as_array().unwrap().len(), 7);
 }
 
+/// Many at once, each touched again a moment after it was filed: none of them is refused for want of memory.
+#[tokio::test(flavor = "multi_thread")]
+async fn many_more_than_memory_holds_come_at_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let (_process, server) = start_with(dir.path(), &["sessions.len_max=150"]).await;
+    let agent = server.agent().await;
+    let mut clients = tokio::task::JoinSet::new();
+    for client in 0..64_u64 {
+        let mut agent = agent.clone();
+        clients.spawn(async move {
+            for turn in 0..12 {
+                let request = pb::OpenSessionRequest { seed: Some(client * 100 + turn), ..Default::default() };
+                let id = agent.open_session(request).await.unwrap().into_inner().session.unwrap().session_id;
+                for step in 1..=2 {
+                    agent.act(asked(&id, step)).await.unwrap();
+                }
+            }
+        });
+    }
+    clients.join_all().await;
+    assert!(server.metric("ada_sessions").await <= 150.0 && server.metric("ada_store_sessions").await >= 700.0);
+}
+
 /// Time to live goes on behind memory; a restart gives everyone the whole of it again, and an ending is remembered.
 #[tokio::test(flavor = "multi_thread")]
 async fn what_has_expired_stays_so() {

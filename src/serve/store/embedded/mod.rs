@@ -40,6 +40,8 @@ const NAMES: TableDefinition<Name, Key> = TableDefinition::new("names");
 /// By name: what is counted as it changes. `bytes`: of all records.
 const COUNTS: TableDefinition<&str, u64> = TableDefinition::new("counts");
 const BYTES: &str = "bytes";
+/// The count in the file may be so far off.
+const COUNT_SLACK: u64 = 64 << 10;
 /// Only there while the home is probed.
 const PROBES: TableDefinition<u64, &[u8]> = TableDefinition::new("probes");
 /// More than a transaction of usual commits, so that a home that was full is not full again at once.
@@ -80,6 +82,7 @@ pub struct Embedded {
     is_lost: Arc<AtomicBool>,
     /// The last failure, for as long as it rests.
     failed: Mutex<Option<(Instant, StoreError)>>,
+    counted: Mutex<Counted>,
 }
 
 impl Embedded {
@@ -96,7 +99,7 @@ impl Embedded {
     }
 
     fn on(open: Open, path: PathBuf, options: Options, is_lost: Arc<AtomicBool>) -> Result<Self, StoreError> {
-        let home = Self { open, path, options, database: RwLock::new(None), is_lost, failed: Mutex::default() };
+        let home = Self { open, path, options, database: RwLock::new(None), is_lost, failed: Mutex::default(), counted: Mutex::default() };
         home.with(|_| Ok(()))?;
         Ok(home)
     }
@@ -142,7 +145,7 @@ impl Embedded {
                 .set_repair_callback(|repair| tracing::info!(progress = repair.progress(), "the store is looked through"));
             let fresh = catch_unwind(AssertUnwindSafe(|| (self.open)(&builder))).unwrap_or_else(|_| Err(damaged()))?;
             let transaction = fresh.begin_write()?;
-            Tables::of(&transaction, self.options)?;
+            *self.counted.lock() = Tables::found(&transaction)?;
             transaction.commit()?;
             metrics::histogram!("ada_recovery_duration_seconds").record(begin.elapsed().as_secs_f64());
             *database = Some(fresh);
@@ -174,23 +177,34 @@ fn refused(error: redb::Error) -> StoreError {
     }
 }
 
-/// All tables, open in a transaction.
-struct Tables<'a> {
-    sessions: Table<'a, Key, &'static [u8]>,
-    endings: Table<'a, Key, (u8, UnixMs)>,
-    names: Table<'a, Name, Key>,
-    counts: Table<'a, &'static str, u64>,
-    /// Of all records, those of this transaction among them.
+/// Bytes of all records.
+#[derive(Clone, Copy, Debug, Default)]
+struct Counted {
     bytes: u64,
+    /// As it stands in the file.
+    kept: u64,
+}
+
+/// A transaction. A table that an act's commit does not need is opened by who needs it: each costs every commit its pages.
+struct Tables<'a> {
+    transaction: &'a WriteTransaction,
+    sessions: Table<'a, Key, &'static [u8]>,
+    counted: Counted,
     options: Options,
 }
 
 impl<'a> Tables<'a> {
-    fn of(transaction: &'a WriteTransaction, options: Options) -> Result<Self, redb::Error> {
-        let (sessions, endings) = (transaction.open_table(SESSIONS)?, transaction.open_table(ENDINGS)?);
-        let (names, counts) = (transaction.open_table(NAMES)?, transaction.open_table(COUNTS)?);
-        let bytes = counts.get(BYTES)?.map_or(0, |bytes| bytes.value());
-        Ok(Self { sessions, endings, names, counts, bytes, options })
+    fn of(transaction: &'a WriteTransaction, counted: Counted, options: Options) -> Result<Self, redb::Error> {
+        Ok(Self { transaction, sessions: transaction.open_table(SESSIONS)?, counted, options })
+    }
+
+    /// Makes all tables, where they are not there.
+    fn found(transaction: &WriteTransaction) -> Result<Counted, redb::Error> {
+        transaction.open_table(SESSIONS)?;
+        transaction.open_table(ENDINGS)?;
+        transaction.open_table(NAMES)?;
+        let kept = transaction.open_table(COUNTS)?.get(BYTES)?.map_or(0, |bytes| bytes.value());
+        Ok(Counted { bytes: kept, kept })
     }
 
     fn make(&mut self, Write { handle, change }: &Write) -> Result<Result<(), Refused>, redb::Error> {
@@ -208,9 +222,9 @@ impl<'a> Tables<'a> {
             return Ok(Err(Refused::Full));
         }
         let before = self.sessions.insert(key, bytes)?.map_or(0, |before| before.value().len());
-        self.bytes = self.bytes.saturating_sub(before as u64) + bytes.len() as u64;
+        self.counted.bytes = self.counted.bytes.saturating_sub(before as u64) + bytes.len() as u64;
         if let Some(name) = name {
-            self.names.insert(name, key)?;
+            self.transaction.open_table(NAMES)?.insert(name, key)?;
         }
         Ok(Ok(()))
     }
@@ -226,15 +240,16 @@ impl<'a> Tables<'a> {
             return Ok(Err(Refused::Conflict));
         }
         let before = self.sessions.remove(key)?.map_or(0, |before| before.value().len());
-        self.bytes = self.bytes.saturating_sub(before as u64);
-        // A name is taken from its own session alone.
-        if let Some(name) = name
-            && self.names.get(name)?.is_some_and(|of| of.value() == key)
-        {
-            self.names.remove(name)?;
+        self.counted.bytes = self.counted.bytes.saturating_sub(before as u64);
+        if let Some(name) = name {
+            let mut names = self.transaction.open_table(NAMES)?;
+            // A name is taken from its own session alone.
+            if names.get(name)?.is_some_and(|of| of.value() == key) {
+                names.remove(name)?;
+            }
         }
         if let Some((ending, at)) = ending {
-            self.endings.insert(key, (code(ending), at))?;
+            self.transaction.open_table(ENDINGS)?.insert(key, (code(ending), at))?;
         }
         Ok(Ok(()))
     }
@@ -245,12 +260,17 @@ impl<'a> Tables<'a> {
 
     /// Those that are there may go on, and grow: a session more is refused before the file is full.
     fn has_room(&self, bytes: u64) -> Result<bool, redb::Error> {
-        Ok(self.sessions.len()? < self.options.len_max && (self.bytes + bytes).saturating_mul(SPREAD) <= self.options.bytes_max)
+        Ok(self.sessions.len()? < self.options.len_max && (self.counted.bytes + bytes).saturating_mul(SPREAD) <= self.options.bytes_max)
     }
 
-    fn close(mut self) -> Result<(), redb::Error> {
-        self.counts.insert(BYTES, self.bytes)?;
-        Ok(())
+    /// Brings the count into the file if it is far from what stands there: most commits change it by little, and a kill costs as much of it.
+    fn count(&mut self) -> Result<Counted, redb::Error> {
+        let Counted { bytes, kept } = &mut self.counted;
+        if bytes.abs_diff(*kept) > COUNT_SLACK {
+            self.transaction.open_table(COUNTS)?.insert(BYTES, *bytes)?;
+            *kept = *bytes;
+        }
+        Ok(self.counted)
     }
 }
 
@@ -269,10 +289,12 @@ impl Home for Embedded {
     fn write(&self, writes: &[Write]) -> Result<Vec<Result<(), Refused>>, StoreError> {
         self.with(|database| {
             let transaction = database.begin_write()?;
-            let mut tables = Tables::of(&transaction, self.options)?;
+            let mut tables = Tables::of(&transaction, *self.counted.lock(), self.options)?;
             let outcomes = writes.iter().map(|write| tables.make(write)).collect::<Result<Vec<_>, _>>()?;
-            tables.close()?;
+            let counted = tables.count()?;
+            drop(tables);
             transaction.commit()?;
+            *self.counted.lock() = counted;
             Ok(outcomes)
         })
     }
@@ -320,9 +342,8 @@ impl Home for Embedded {
     fn size(&self) -> Result<Size, StoreError> {
         let medium_bytes = self.path.metadata().map_or(0, |file| file.len());
         self.with(|database| {
-            let transaction = database.begin_read()?;
-            let bytes = transaction.open_table(COUNTS)?.get(BYTES)?.map_or(0, |bytes| bytes.value());
-            Ok(Size { sessions: transaction.open_table(SESSIONS)?.len()?, bytes, medium_bytes })
+            let sessions = database.begin_read()?.open_table(SESSIONS)?.len()?;
+            Ok(Size { sessions, bytes: self.counted.lock().bytes, medium_bytes })
         })
     }
 

@@ -222,7 +222,7 @@ fn sessions_are_bounded_in_number_and_in_bytes() {
     drop(home);
     // Bytes are counted over restarts.
     let home = Embedded::open(dir.path(), Options { bytes_max: 8 << 20, ..OPTIONS }).unwrap();
-    assert_eq!(home.size().unwrap().bytes, bytes(2));
+    assert!(home.size().unwrap().bytes <= COUNT_SLACK, "so far off it may be");
     let mut refused = None;
     for i in 10..4_000 {
         if let Err(Refused::Full) = home.write(&[keep(i, None, 0, 9_000)]).unwrap()[0] {
@@ -231,7 +231,10 @@ fn sessions_are_bounded_in_number_and_in_bytes() {
         }
     }
     let held = home.size().unwrap();
-    assert!(refused.is_some() && held.bytes * SPREAD <= 8 << 20 && (held.bytes + 10_000) * SPREAD > 8 << 20, "{held:?}");
+    drop(home);
+    let home = Embedded::open(dir.path(), Options { bytes_max: 8 << 20, ..OPTIONS }).unwrap();
+    assert!(home.size().unwrap().bytes.abs_diff(held.bytes) <= COUNT_SLACK, "over a restart");
+    assert!(refused.is_some() && held.bytes * SPREAD <= 8 << 20 && (held.bytes + 10_000 + COUNT_SLACK) * SPREAD > 8 << 20, "{held:?}");
     for step in 0..200 {
         assert_eq!(home.write(&[keep(10, Some(step), step + 1, 9_000)]), Ok(vec![Ok(())]), "those that are there go on");
     }
