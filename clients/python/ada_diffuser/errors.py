@@ -134,7 +134,7 @@ class DeadlineExceeded(AdaError):
 
 
 class Unavailable(AdaError):
-    """The same again after `retry_after_ms`: no connection, or DRAINING, NOT_READY, STORE_UNAVAILABLE."""
+    """The same again after `retry_after_ms`: no connection, or DRAINING, NOT_READY, CONNECTIONS_FULL, STORE_UNAVAILABLE."""
 
     retryable = True
 

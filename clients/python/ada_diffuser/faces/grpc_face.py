@@ -45,6 +45,8 @@ _CHANNEL_OPTIONS = [
     ("grpc.min_reconnect_backoff_ms", int(CONNECT_S * 1000)),
     ("grpc.keepalive_time_ms", int(SILENT_S * 1000)),
     ("grpc.keepalive_timeout_ms", int(PROOF_S * 1000)),
+    # Of a ping of another kind, which gRPC measures the path with: while it waits for that one it sends no other.
+    ("grpc.http2.ping_timeout_ms", int(PROOF_S * 1000)),
     # Also while there is no call: the next one then finds a new connection, and not a dead one.
     ("grpc.keepalive_permit_without_calls", 1),
     ("grpc.http2.max_pings_without_data", 0),
