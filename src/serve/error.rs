@@ -53,7 +53,7 @@ pub enum ServiceError {
         committed: u64,
     },
     /// Open a session.
-    #[error("no such session: it was closed, or is of a server that ended since and kept none (ada-server --store DIR keeps them)")]
+    #[error("no such session: it was closed, or its server was restarted without a store to keep it (ada-server --store DIR)")]
     SessionNotFound,
     /// Open a session: this one was idle for too long.
     #[error("the session has expired")]

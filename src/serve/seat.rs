@@ -12,8 +12,10 @@ use crate::{
 use std::{sync::Arc, time::Instant};
 use uuid::Uuid;
 
-/// What a client is told to wait when the server is starting or ending.
+/// What a client is told to wait when the server is ending.
 pub(super) const RETRY_AFTER_RESTART_MS: u64 = 1_000;
+/// What a client is told to wait when the server is starting: it is ready in less than a second, and everybody stands still until then.
+pub(super) const RETRY_AFTER_LOADING_MS: u64 = 100;
 
 /// See the module.
 pub(super) struct Seat {

@@ -11,7 +11,7 @@ use crate::{
         keeper::{Keeper, KeeperError},
         registry::{Model, Registry, RegistryError},
         request::{ActRequest, ActResult, Acted, ForkRequest, ImportRequest, ListRequest, OpenRequest, Opened, Page, ResetRequest},
-        seat::{RETRY_AFTER_RESTART_MS, Seat},
+        seat::{RETRY_AFTER_LOADING_MS, RETRY_AFTER_RESTART_MS, Seat},
         session::{Answer, Entry, Handle, Opening, Record, Session, Standing, Summary, Untold, Waiter, is_request_id, key_of},
         telemetry,
     },
@@ -434,11 +434,10 @@ impl Service {
     }
 
     fn registry(&self) -> Result<&Registry, ServiceError> {
-        let retry_after_ms = RETRY_AFTER_RESTART_MS;
         if self.draining.is_cancelled() {
-            return Err(ServiceError::Draining { retry_after_ms });
+            return Err(ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS });
         }
-        self.registry.get().ok_or(ServiceError::NotReady { retry_after_ms })
+        self.loaded()
     }
 
     async fn session(&self, session_id: &str) -> Result<Arc<Session>, ServiceError> {
@@ -447,7 +446,7 @@ impl Service {
 
     /// The models, while draining too.
     fn loaded(&self) -> Result<&Registry, ServiceError> {
-        self.registry.get().ok_or(ServiceError::NotReady { retry_after_ms: RETRY_AFTER_RESTART_MS })
+        self.registry.get().ok_or(ServiceError::NotReady { retry_after_ms: RETRY_AFTER_LOADING_MS })
     }
 
     fn ttl(&self, ttl_ms: Option<u64>) -> Result<Duration, ServiceError> {

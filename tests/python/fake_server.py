@@ -28,6 +28,9 @@ CODES = {
     "STEP_PAYLOAD_MISMATCH": (grpc.StatusCode.FAILED_PRECONDITION, 422),
     "ENGINE_PANIC": (grpc.StatusCode.INTERNAL, 500),
     "SESSION_NOT_FOUND": (grpc.StatusCode.NOT_FOUND, 404),
+    "STORE_UNAVAILABLE": (grpc.StatusCode.UNAVAILABLE, 503),
+    "STORE_FULL": (grpc.StatusCode.RESOURCE_EXHAUSTED, 507),
+    "STATE_CORRUPT": (grpc.StatusCode.DATA_LOSS, 500),
     "TOO_LARGE": (grpc.StatusCode.RESOURCE_EXHAUSTED, 413),
     "REQUEST_INVALID": (grpc.StatusCode.INVALID_ARGUMENT, 400),
 }

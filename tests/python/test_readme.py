@@ -66,7 +66,11 @@ GIVEN = {
 }
 
 SAYS = {
-    "README.md": ['"actions":', '"latent_mean":', '"evaluations":8', '"step":2', '"cheetah-wind-s"'],
+    "README.md": [
+        *('"actions":', '"latent_mean":', '"evaluations":8', '"step":2', '"cheetah-wind-s"'),
+        *('"committed_step":1', '"replayed":true'),
+    ],
+    "clients/http/README.md": ['"committed_step":1', '"replayed":true'],
     "docs/identification.md": [
         "posterior, from exact probabilities: off by less than 1e-12: True",
         "eigenvalues are the k of both contexts: True",

@@ -5,7 +5,7 @@
 """
 
 from ada_diffuser.broker import ChunkBroker
-from ada_diffuser.client import Client, Session
+from ada_diffuser.client import Client
 from ada_diffuser.errors import (
     AdaError,
     Cancelled,
@@ -17,7 +17,9 @@ from ada_diffuser.errors import (
     PayloadMismatch,
     ServerFault,
     SessionGone,
+    StateCorrupt,
     StepConflict,
+    StoreFull,
     TooLarge,
     Unavailable,
     UnexpectedAnswer,
@@ -37,6 +39,7 @@ from ada_diffuser.messages import (
     TrueContext,
 )
 from ada_diffuser.retry import RetryPolicy
+from ada_diffuser.session import Session
 
 __version__ = "0.1.0"
 
@@ -63,7 +66,9 @@ __all__ = [
     "Session",
     "SessionGone",
     "SessionSummary",
+    "StateCorrupt",
     "StepConflict",
+    "StoreFull",
     "Timings",
     "Told",
     "TooLarge",

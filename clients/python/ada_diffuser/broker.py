@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ada_diffuser.client import Session
 from ada_diffuser.messages import Chunk, Executed, Observation
+from ada_diffuser.session import Session
 from ada_diffuser.values import Floats, number, vector
 
 

@@ -3,10 +3,11 @@
     with Client("grpc://127.0.0.1:7777") as client, client.open_session(seed=7) as session:
         chunk = session.act(state)
 
-What is sent again: an act, a batch, a reset, a close or a question that failed as `Overloaded`, `DeadlineExceeded` or
-`Unavailable`, after a wait (`RetryPolicy`). An act is sent again with the same step and the same bytes, so the server either
-takes it once or answers as it did before (`Chunk.replayed`). If all attempts fail, the last error is raised and the
-session stands where it stood: call `act` with the same observation again, whenever you like.
+What is sent again: every call that failed as `Overloaded`, `DeadlineExceeded` or `Unavailable`, so also one that finds no server or
+one that is starting, until it is answered or `RetryPolicy.budget_s` is spent. An act is sent again with the same step and the same
+bytes, so the server either takes it once or answers as it did before (`Chunk.replayed`), and one with a store does so after it was killed
+and started again. When the budget is spent the last error is raised and the session stands where it stood: call `act` with the same
+observation again, whenever you like.
 
 Processes: clients and sessions may be made before a fork, pickled and copied. A client has connections of its own in each
 process; a session goes on in the other one from the step where it stood, and only one of the two may go on with it.
@@ -19,13 +20,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from types import TracebackType
 from typing import Any, TypeVar
 from uuid import uuid4
 
 from numpy.typing import ArrayLike, NDArray
 
-from ada_diffuser.errors import AdaError, InvalidInput, NotFound, TooLarge, Unavailable
+from ada_diffuser.errors import AdaError, Detail, InvalidInput, NotFound, StepConflict, TooLarge, Unavailable
 from ada_diffuser.faces import Face, connect
 from ada_diffuser.messages import (
     ActCall,
@@ -40,12 +40,15 @@ from ada_diffuser.messages import (
     executed_values,
 )
 from ada_diffuser.retry import Backoff, RetryPolicy
-from ada_diffuser.values import column, flag, invalid, matrix, text, vector, whole
+from ada_diffuser.session import Session, rewarded
+from ada_diffuser.values import flag, invalid, text, whole, whole_if_given
 
 T = TypeVar("T")
 
 #: Longer than anybody waits, and short enough for every clock below.
 _TIMEOUT_S_MAX = 1e8
+#: Who leaves because of an error waits no longer for the end of its session.
+_LET_GO_S = 1.0
 
 
 class Client:
@@ -58,7 +61,7 @@ class Client:
         """`url` is `grpc://host:port` or `http://host:port`; `timeout_s` bounds each attempt of each call, alike on both faces.
 
         It is when this side hangs up: the server is not told to hurry, and an act never comes out coarser for it. That is what the
-        `deadline_ms` of an act asks for.
+        `deadline_ms` of an act asks for. All attempts of a call together take no longer than `retry.budget_s`.
         """
         self.url = url
         self._timeout_s = float(timeout_s)
@@ -139,7 +142,7 @@ class Client:
         episodes. Refused where the model's `trained.sessions` is false, or nothing in it looks back so far.
         If an answer is lost on the way, the retry gets the session that the first attempt has opened.
         """
-        name, seed, ttl_ms = _model_name(model), _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
+        name, seed, ttl_ms = _model_name(model), whole_if_given(seed, "seed"), whole_if_given(ttl_ms, "ttl_ms")
         call = OpenCall(name, seed, _options(options), ttl_ms, uuid4().hex, executed_values(history, "history"))
         summary, spec = self._tried(lambda timeout_s: self._face.open_session(call, timeout_s))
         return Session(self, summary, spec)
@@ -152,14 +155,24 @@ class Client:
         """
         if not isinstance(record, (bytes, bytearray, memoryview)):
             raise invalid("record", f"is no bytes, but a {type(record).__name__}")
-        record, ttl_ms, request_id = bytes(record), _whole_if_given(ttl_ms, "ttl_ms"), uuid4().hex
+        record, ttl_ms, request_id = bytes(record), whole_if_given(ttl_ms, "ttl_ms"), uuid4().hex
         summary, spec = self._tried(lambda timeout_s: self._face.import_session(record, ttl_ms, request_id, timeout_s))
         return Session(self, summary, spec)
 
-    def attach(self, session_id: str) -> Session:
-        """A session that was opened elsewhere, or before this program was started again."""
+    def attach(self, session_id: str, *, committed_step: int | None = None) -> Session:
+        """A session that was opened elsewhere, or before this program was started again. It goes on from where it stands on the server.
+
+        `committed_step` is for who may have lost the answer of its last act: how many answers of the running episode it has. Where that is
+        one fewer than the server has committed, the next `act` asks for the lost one, and gets it (`Chunk.replayed`) if it is told the
+        same as then. `StepConflict` where it is any other number.
+        """
+        known = whole_if_given(committed_step, "committed_step")
         summary = self.summary(session_id)
-        return Session(self, summary, self.model(f"{summary.model}@{summary.model_digest}"))
+        if known is not None and known not in (summary.committed_step, summary.committed_step - 1):
+            message = f"{known} answers are neither all of the session's {summary.committed_step} nor all but the last"
+            raise StepConflict(Detail(message, "STEP_OUT_OF_ORDER", "committed_step", summary.committed_step))
+        model = self.model(f"{summary.model}@{summary.model_digest}")
+        return Session(self, summary if known is None else replace(summary, committed_step=known), model)
 
     def summary(self, session_id: str) -> SessionSummary:
         """The state of a session."""
@@ -222,7 +235,10 @@ class Client:
             settled.update(zip(pending, self._batch([calls[i] for i in pending], backoff), strict=True))
             failed = [(i, result) for i, result in settled.items() if isinstance(result, AdaError) and result.retryable]
             pending = [i for i, _ in failed]
-            if pending and not backoff.wait(max(error.retry_after_ms or 0 for _, error in failed)):
+            if not pending:
+                backoff.answered()
+            elif not backoff.wait(max((error for _, error in failed), key=lambda error: error.retry_after_ms or 0)):
+                settled.update((i, backoff.given_up(error)) for i, error in failed)
                 break
         return [settled[i] for i in range(len(calls))]
 
@@ -255,7 +271,7 @@ class Client:
         return self._tried(lambda timeout_s: self._face.act(call, timeout_s))
 
     def _reset(self, session_id: str, seed: int | None, keep_history: bool, episode: int) -> SessionSummary:
-        seed, keep_history, request_id = _whole_if_given(seed, "seed"), flag(keep_history, "keep_history"), uuid4().hex
+        seed, keep_history, request_id = whole_if_given(seed, "seed"), flag(keep_history, "keep_history"), uuid4().hex
         # An act that was given up here may still be in flight there, for a moment: worth the wait.
         return self._tried(
             lambda timeout_s: self._face.reset_session(session_id, seed, keep_history, request_id, episode, timeout_s),
@@ -274,6 +290,11 @@ class Client:
         with suppress(NotFound):
             self._tried(lambda timeout_s: self._face.close_session(session_id, timeout_s))
 
+    def _let_go(self, session_id: str) -> None:
+        """A close that nobody waits for: the session expires if it is not heard."""
+        with suppress(AdaError):
+            self._face.close_session(session_id, min(self._timeout_s, _LET_GO_S))
+
 
 def _pairs(
     acts: Sequence[tuple[Session, Observation | ArrayLike]] | Sequence[Session],
@@ -291,12 +312,7 @@ def _pairs(
             raise invalid(name, f"has {len(rows)} rows for {len(acts)} sessions")
     told = [None] * len(acts) if rewards is None else rewards
     sessions: Sequence[Any] = acts
-    return [(session, Observation(state, _rewarded(reward))) for session, state, reward in zip(sessions, states, told, strict=True)]
-
-
-def _rewarded(reward: ArrayLike | None) -> list[Executed]:
-    """Steps of which the rewards are known: one number, or one for each."""
-    return [] if reward is None else [Executed(reward=value) for value in column(reward, "observation.reward")]
+    return [(session, Observation(state, rewarded(reward))) for session, state, reward in zip(sessions, states, told, strict=True)]
 
 
 def _model_name(name: str | None) -> str:
@@ -315,131 +331,3 @@ def _options(options: SamplerOptions | None) -> SamplerOptions:
     if not isinstance(options, SamplerOptions):
         raise invalid("options", f"is no SamplerOptions, but a {type(options).__name__}")
     return options.checked()
-
-
-def _whole_if_given(value: int | None, field: str, bits: int = 64) -> int | None:
-    return None if value is None else whole(value, field, bits)
-
-
-class Session:
-    """One episode after the other, on one model. A context manager that closes the session.
-
-    It pickles and copies as its id, its client's settings and the step where it stands; the copy goes on from there.
-    """
-
-    def __init__(self, client: Client, summary: SessionSummary, model: Model) -> None:
-        """Made by `Client.open_session` and `Client.attach`."""
-        self._client = client
-        self.session_id = summary.session_id
-        #: The model: dimensions, horizons, bounds of the actions.
-        self.model = model
-        #: Sampling options in force.
-        self.options = summary.options
-        #: Seed of the running episode.
-        self.seed = summary.seed
-        self._committed_step = summary.committed_step
-        self._episode = summary.episode
-        self._closed = False
-
-    def __enter__(self) -> Session:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        try:
-            self.close()
-        except AdaError:
-            if error is None:
-                raise
-
-    @property
-    def committed_step(self) -> int:
-        """Acts of the running episode that this client has the answer of."""
-        return self._committed_step
-
-    def act(
-        self,
-        state: ArrayLike,
-        executed: Sequence[Executed] = (),
-        *,
-        reward: ArrayLike | None = None,
-        nothing_executed: bool = False,
-        context: ArrayLike | None = None,
-        deadline_ms: int | None = None,
-        planned_states: bool = False,
-    ) -> Chunk:
-        """One observation in, one chunk of actions out.
-
-        `state` is the current state, `(state_dim,)`. `executed` says what was executed since the last act; empty means the
-        whole last chunk. `reward` is short for it when only rewards are to be told: one for each step executed since.
-        `nothing_executed` plans anew in the place of the last act: none of its actions was executed, and no time has passed.
-        `context` is what an oracle is told, `(steps, dim)`, see `Observation.context`.
-        """
-        if reward is not None:
-            if len(executed):
-                raise ValueError("rewards stand in `executed` when it is given")
-            executed = _rewarded(reward)
-        call = self.next_call(Observation(state, executed, nothing_executed, context), deadline_ms, planned_states)
-        chunk = self._client._act(call)
-        self.commit(chunk)
-        return chunk
-
-    def next_call(self, observation: Observation, deadline_ms: int | None = None, planned_states: bool = False) -> ActCall:
-        """The act that comes next, as it is sent, each time it is sent."""
-        return ActCall(
-            session_id=self.session_id,
-            step=self._committed_step + 1,
-            episode=self._episode,
-            state=vector(observation.state, "observation.state"),
-            executed=executed_values(observation.executed, "observation.executed"),
-            nothing_executed=flag(observation.nothing_executed, "observation.nothing_executed"),
-            deadline_ms=_whole_if_given(deadline_ms, "deadline_ms", bits=32),
-            want_planned_states=flag(planned_states, "want_planned_states"),
-            context=None if observation.context is None else matrix(observation.context, "observation.context"),
-        )
-
-    def commit(self, chunk: Chunk) -> None:
-        """Notes that the answer of the next act has arrived."""
-        if chunk.session_id != self.session_id or chunk.step != self._committed_step + 1:
-            raise InvalidInput(f"step {chunk.step} of {chunk.session_id} is not the next of {self.session_id}")
-        self._committed_step = chunk.step
-
-    def reset(self, seed: int | None = None, *, keep_history: bool = False) -> None:
-        """A new episode: committed step 0 again. Without `seed` the server draws one.
-
-        With `keep_history` the latent goes on looking back on the old episode, for a context that outlasts episodes; refused where the
-        model's `trained.sessions` is false.
-        """
-        summary = self._client._reset(self.session_id, seed, keep_history, self._episode)
-        self.seed, self._committed_step, self._episode = summary.seed, summary.committed_step, summary.episode
-
-    def summary(self) -> SessionSummary:
-        """The state of the session on the server."""
-        return self._client.summary(self.session_id)
-
-    def catch_up(self) -> int:
-        """Takes over the server's episode and committed step, after a `StepConflict` or `PayloadMismatch`; returns the step."""
-        summary = self.summary()
-        self.seed, self._committed_step, self._episode = summary.seed, summary.committed_step, summary.episode
-        return self._committed_step
-
-    def export(self) -> bytes:
-        """The session as bytes, as it stands on the server: to go on with it elsewhere, or later (`Client.import_session`).
-
-        This one goes on too. The bytes tell what it has seen, so they are as private as that; they hold neither its id nor the model.
-        """
-        return self._client._export(self.session_id)
-
-    def fork(self, seed: int | None = None, *, ttl_ms: int | None = None) -> Session:
-        """Another session that goes on from here; this one goes on too.
-
-        Without `seed` both have the same future, as long as they see the same; with it the noise from now on is another one: plans to
-        compare, in a simulator that was copied. `StepConflict` where the server's session stands elsewhere.
-        """
-        seed, ttl_ms = _whole_if_given(seed, "seed"), _whole_if_given(ttl_ms, "ttl_ms")
-        return self._client._fork(ForkCall(self.session_id, seed, ttl_ms, uuid4().hex, self._committed_step, self._episode))
-
-    def close(self) -> None:
-        """Ends the session on the server; a second close does nothing."""
-        if not self._closed:
-            self._client._close_session(self.session_id)
-            self._closed = True

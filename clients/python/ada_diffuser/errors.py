@@ -80,11 +80,22 @@ class TooLarge(AdaError):
 
 
 class NotFound(AdaError):
-    """No such session or model. SESSION_NOT_FOUND, MODEL_NOT_FOUND."""
+    """No such model, or no such session (`SessionGone`). MODEL_NOT_FOUND."""
 
 
 class SessionGone(NotFound):
-    """The session expired or made room for others: open a new one. SESSION_EXPIRED, SESSION_EVICTED."""
+    """The session was closed, expired, made room for others, or ended with its server: open a new one.
+
+    SESSION_NOT_FOUND, SESSION_EXPIRED, SESSION_EVICTED.
+    """
+
+    cure = "open a new session, or go on from an export of this one (client.import_session)"
+
+
+class StateCorrupt(SessionGone):
+    """What the server had kept of this session is damaged; all others go on. Report `error_id`. STATE_CORRUPT."""
+
+    cure = "or go on from an export of it (client.import_session)"
 
 
 class ModelGone(NotFound):
@@ -110,6 +121,12 @@ class Overloaded(AdaError):
     retryable = True
 
 
+class StoreFull(AdaError):
+    """The server has no room to keep this, so that nothing was changed: the same again once there is some. STORE_FULL."""
+
+    cure = "make room for it (store.dir, store.bytes_max, store.len_max), or close sessions; then the same call again is done"
+
+
 class DeadlineExceeded(AdaError):
     """The same again: it happens now, or gives the answer if it was committed meanwhile. DEADLINE_*, or this client's timeout."""
 
@@ -117,7 +134,7 @@ class DeadlineExceeded(AdaError):
 
 
 class Unavailable(AdaError):
-    """The same again after `retry_after_ms`: no connection, or DRAINING, NOT_READY."""
+    """The same again after `retry_after_ms`: no connection, or DRAINING, NOT_READY, CONNECTIONS_FULL, STORE_UNAVAILABLE."""
 
     retryable = True
 
@@ -139,23 +156,27 @@ _BY_REASON: dict[str, type[AdaError]] = {
     "REQUEST_INVALID": InvalidInput,
     "OPTIONS_INVALID": InvalidInput,
     "TOO_LARGE": TooLarge,
-    "SESSION_NOT_FOUND": NotFound,
     "MODEL_NOT_FOUND": NotFound,
     "MODEL_GONE": ModelGone,
+    "SESSION_NOT_FOUND": SessionGone,
     "SESSION_EXPIRED": SessionGone,
     "SESSION_EVICTED": SessionGone,
+    "STATE_CORRUPT": StateCorrupt,
     "STEP_OUT_OF_ORDER": StepConflict,
     "SESSION_BUSY": StepConflict,
     "EPISODE_OVER": StepConflict,
     "STEP_PAYLOAD_MISMATCH": PayloadMismatch,
     "QUEUE_FULL": Overloaded,
     "QUOTA": Overloaded,
+    "STORE_FULL": StoreFull,
     "DEADLINE_ADMISSION": DeadlineExceeded,
     "DEADLINE_QUEUE": DeadlineExceeded,
     "DEADLINE_COMPUTE": DeadlineExceeded,
     "CANCELLED": Cancelled,
     "DRAINING": Unavailable,
     "NOT_READY": Unavailable,
+    "CONNECTIONS_FULL": Unavailable,
+    "STORE_UNAVAILABLE": Unavailable,
     "NONFINITE_OUTPUT": ServerFault,
     "ENGINE_PANIC": ServerFault,
     "INTERNAL": ServerFault,
@@ -171,6 +192,7 @@ _BY_GRPC_CODE: dict[int, type[AdaError]] = {
     10: StepConflict,
     13: ServerFault,
     14: Unavailable,
+    15: ServerFault,
 }
 
 _BY_HTTP_STATUS: dict[int, type[AdaError]] = {
@@ -186,6 +208,7 @@ _BY_HTTP_STATUS: dict[int, type[AdaError]] = {
     502: Unavailable,
     503: Unavailable,
     504: DeadlineExceeded,
+    507: StoreFull,
 }
 
 

@@ -73,6 +73,11 @@ def whole(value: Any, field: str, bits: int = 64) -> int:
     return one
 
 
+def whole_if_given(value: Any, field: str, bits: int = 64) -> int | None:
+    """The same, or None."""
+    return None if value is None else whole(value, field, bits)
+
+
 def flag(value: Any, field: str) -> bool:
     """True or False; 0 and 1 are neither."""
     one = _single(_array(value, field), field).item()

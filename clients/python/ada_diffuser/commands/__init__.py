@@ -11,7 +11,10 @@ from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from ada_diffuser.client import Client
+from ada_diffuser.commands.progress import saying
 from ada_diffuser.errors import AdaError
+from ada_diffuser.retry import RetryPolicy
 
 if TYPE_CHECKING:
     from ada_diffuser.rollout.warm_start import WarmStart
@@ -60,7 +63,19 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
     """Where the server is, and which face is used."""
     parser.add_argument("--url", default=DEFAULT_URL, help=f"host:port, grpc:// or http:// before it or not (default {DEFAULT_URL})")
     parser.add_argument("--face", choices=("grpc", "http"), help="(default: what the url says, else grpc)")
-    parser.add_argument("--wait", type=seconds, default=10.0, metavar="S", help="wait so long for the server (default 10)")
+    parser.add_argument("--wait", type=seconds, default=10.0, metavar="S", help="wait so long for the server to be there (default 10)")
+    parser.add_argument(
+        "--budget",
+        type=seconds,
+        default=RetryPolicy.budget_s,
+        metavar="S",
+        help="give up when a call is not answered within so long, as while the server is started again (default %(default)g)",
+    )
+
+
+def client_of(arguments: argparse.Namespace) -> Client:
+    """The client that `add_server_arguments` describe; nothing is sent yet."""
+    return Client(server_url(arguments.url, arguments.face), retry=RetryPolicy(budget_s=arguments.budget))
 
 
 def seconds(text: str) -> float:
@@ -111,7 +126,8 @@ def run_command(program: str, run: Callable[[], object], *, status: int = 1, ext
     # Modules of the caller's (MODULE:ID) are found in the working directory, as by `python -m`; installed ones come first.
     sys.path.append(os.getcwd())
     try:
-        run()
+        with saying(program):
+            run()
         sys.stdout.flush()
     except BrokenPipeError:
         # Nobody reads any more (`| head`). Python flushes stdout once more at exit, and would complain.

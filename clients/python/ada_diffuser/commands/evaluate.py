@@ -9,17 +9,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ada_diffuser.client import Client
 from ada_diffuser.commands import (
     add_environment_arguments,
     add_server_arguments,
     add_trial_arguments,
     check_environment,
     choose,
+    client_of,
     environment_options,
     parse_settings,
     run_command,
-    server_url,
     warm_start,
 )
 from ada_diffuser.commands.outputs import check_output, save_json
@@ -192,7 +191,7 @@ def _run_all(arguments: argparse.Namespace, trials: Sequence[Trial], results: li
     from ada_diffuser.rollout.readout import read
     from ada_diffuser.rollout.seeds import by_recipe
 
-    with Client(server_url(arguments.url, arguments.face)) as client:
+    with client_of(arguments) as client:
         client.wait_ready(arguments.wait)
         steps = [trial.episodes * check(client, trial) for trial in trials]
         for n, trial in enumerate(trials, start=1):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +24,32 @@ def progress(total: int, title: str, unit: str, *, quiet: bool = False) -> Itera
             yield bar.update
     else:
         yield _Lines(total, title, unit).add
+
+
+@contextmanager
+def saying(program: str) -> Iterator[None]:
+    """What the client has to say meanwhile stands on stderr, a line each, and behind the program's name."""
+    log, words = logging.getLogger("ada_diffuser"), _Words(program)
+    log.addHandler(words)
+    try:
+        yield
+    finally:
+        log.removeHandler(words)
+
+
+class _Words(logging.Handler):
+    def __init__(self, program: str) -> None:
+        super().__init__()
+        self._program = program
+
+    def emit(self, record: logging.LogRecord) -> None:
+        line = f"{self._program}: {record.getMessage()}"
+        if sys.stderr.isatty():
+            from tqdm import tqdm
+
+            tqdm.write(line, file=sys.stderr)  # a bar that stands there gives way to it
+        else:
+            print(line, file=sys.stderr, flush=True)
 
 
 @dataclass

@@ -9,16 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ada_diffuser.client import Client
 from ada_diffuser.commands import (
     add_environment_arguments,
     add_server_arguments,
     add_trial_arguments,
     check_environment,
+    client_of,
     environment_options,
     parse_settings,
     run_command,
-    server_url,
     warm_start,
 )
 from ada_diffuser.commands.outputs import check_output, save_json
@@ -33,7 +32,9 @@ Drives an environment with a model on a running ada-server and prints what it ea
 play the same episodes: a column of the table, a colour of the plot and a panel of the film for each.
 Folders of --json, --plot and --film are made before the first episode, and one that fails does not keep back the others.
 Episode e runs with seed SEED + e, in the environment and in the model, so the same command gives the same returns and all
-models see the same episodes. Failed is what the environment's class calls failed (clients/python/README.md lists it)."""
+models see the same episodes. Failed is what the environment's class calls failed (clients/python/README.md lists it).
+Where the server goes away under way, the run waits for it, --budget seconds at most, and a line says how long it was away. On
+a server with a store (ada-server --store) it then goes on as if nothing had been; on one without, its sessions are gone, and it ends."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,7 +88,7 @@ def _run(arguments: argparse.Namespace) -> None:
         warm_start=warm_start(arguments),
     )
     trials = [first, *(replace(first, model=model) for model in arguments.beside)]
-    with Client(server_url(arguments.url, arguments.face)) as client:
+    with client_of(arguments) as client:
         client.wait_ready(arguments.wait)
         steps = sum(trial.episodes * check(client, trial) for trial in trials)
         with progress(steps, first.env, "step") as advance:

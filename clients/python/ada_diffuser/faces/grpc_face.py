@@ -9,6 +9,7 @@ import grpc
 import numpy as np
 
 from ada_diffuser.errors import AdaError, Cancelled, Detail, UnexpectedAnswer, from_detail
+from ada_diffuser.faces.liveness import CONNECT_S, PROOF_S, SILENT_S
 from ada_diffuser.faces.proxy import Proxy
 from ada_diffuser.messages import (
     ActCall,
@@ -31,14 +32,24 @@ from ada_diffuser.options import MODE, NUMBERS, Kind
 from ada_diffuser.v1 import agent_pb2, agent_pb2_grpc, models_pb2, models_pb2_grpc
 from ada_diffuser.values import Floats
 
-#: gRPC must not retry by itself (the client does), and must find a restarted server again within seconds. Channels must not
-#: share connections: after a fork a new channel would be given the parent's.
+#: gRPC must not retry by itself (the client does), and must find a restarted server again within a quarter of a second: left alone it
+#: waits for up to two minutes between connections, and calls fail meanwhile without trying one. Channels must not share connections: after
+#: a fork a new channel would be given the parent's.
 _CHANNEL_OPTIONS = [
     ("grpc.use_local_subchannel_pool", 1),
     ("grpc.enable_retries", 0),
     ("grpc.max_receive_message_length", 64 << 20),
     ("grpc.initial_reconnect_backoff_ms", 100),
-    ("grpc.max_reconnect_backoff_ms", 2000),
+    ("grpc.max_reconnect_backoff_ms", 250),
+    # Of a connection that does not come to stand; the name is historical.
+    ("grpc.min_reconnect_backoff_ms", int(CONNECT_S * 1000)),
+    ("grpc.keepalive_time_ms", int(SILENT_S * 1000)),
+    ("grpc.keepalive_timeout_ms", int(PROOF_S * 1000)),
+    # Of a ping of another kind, which gRPC measures the path with: while it waits for that one it sends no other.
+    ("grpc.http2.ping_timeout_ms", int(PROOF_S * 1000)),
+    # Also while there is no call: the next one then finds a new connection, and not a dead one.
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.max_pings_without_data", 0),
 ]
 
 _STARTS: dict[int, Start] = {

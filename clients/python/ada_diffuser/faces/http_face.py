@@ -22,6 +22,7 @@ from urllib.parse import quote, urlencode
 
 from ada_diffuser.errors import AdaError, DeadlineExceeded, Detail, Unavailable, UnexpectedAnswer, from_detail
 from ada_diffuser.faces import http_json
+from ada_diffuser.faces.liveness import CONNECT_S, PROOF_S, SILENT_S
 from ada_diffuser.messages import ActCall, Chunk, ForkCall, Model, OpenCall, SessionSummary
 
 #: A longer body is announced before it is sent: a server that finds it too large says so, and need not be sent all of it.
@@ -29,6 +30,13 @@ _ANNOUNCED_LEN = 256 * 1024
 #: Who does not answer that in so long does not know how to.
 _ANNOUNCED_S = 1.0
 _CONTINUE = b"HTTP/1.1 100"
+#: What the kernel is asked to do about a silent peer, by the names that it knows; the last is also of bytes that nobody acknowledges.
+_LIVENESS = {
+    "TCP_KEEPIDLE": int(SILENT_S),
+    "TCP_KEEPINTVL": int(PROOF_S),
+    "TCP_KEEPCNT": 1,
+    "TCP_USER_TIMEOUT": int((SILENT_S + PROOF_S) * 1000),
+}
 
 
 class HttpFace:
@@ -126,24 +134,23 @@ class HttpFace:
         """One request and its whole answer. A connection that failed is not used again."""
         end = time.monotonic() + timeout_s
         connection = self._take()
-        connection.timeout = timeout_s
         payload = None if body is None else json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
         headers = {"Accept": "application/json"}
         if payload is not None:
             headers["Content-Type"] = "application/json"
         try:
             if connection.sock is None:
-                connection.connect()
+                _connect(connection, timeout_s)
             connection.sock.settimeout(_left(end))
             connection.response_class = partial(_Response, end=end)
             sent = _send(connection, method, path, payload, headers, end)
             response = connection.getresponse()
             text = response.read()
-        except TimeoutError:
-            connection.close()
-            raise DeadlineExceeded(f"no answer from {self._host}:{self._port} within {timeout_s:g} s") from None
         except (OSError, http.client.HTTPException) as error:
             connection.close()
+            # With a number it is the kernel's, of a peer that is gone, and not of the time that the call had.
+            if isinstance(error, TimeoutError) and error.errno is None:
+                raise DeadlineExceeded(f"no answer from {self._host}:{self._port} within {timeout_s:g} s") from None
             raise Unavailable(f"{self._host}:{self._port}: {error or type(error).__name__}") from None
         with self._lock:
             kept = sent and not (response.will_close or self._closed)
@@ -163,6 +170,21 @@ class HttpFace:
             if connection.sock is not None and _is_alive(connection.sock):
                 return connection
             connection.close()
+
+
+def _connect(connection: http.client.HTTPConnection, timeout_s: float) -> None:
+    """Within the timeout of the call, or what a connection may take; then the peer is watched."""
+    connection.timeout = min(timeout_s, CONNECT_S)
+    try:
+        connection.connect()
+    except TimeoutError as error:
+        if timeout_s <= CONNECT_S or error.errno is not None:
+            raise
+        raise ConnectionError(f"no connection within {CONNECT_S:g} s") from None
+    connection.sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in _LIVENESS.items():
+        if hasattr(socket, name):
+            connection.sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 def _send(

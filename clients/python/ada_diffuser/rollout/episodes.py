@@ -14,12 +14,13 @@ import numpy as np
 
 from ada_diffuser import environments
 from ada_diffuser.broker import ChunkBroker
-from ada_diffuser.client import Client, Session
+from ada_diffuser.client import Client
 from ada_diffuser.errors import AdaError
 from ada_diffuser.messages import Chunk, Model, Observation, SamplerOptions
 from ada_diffuser.rollout.goal import wanted_columns, with_goal
 from ada_diffuser.rollout.oracle import true_context
 from ada_diffuser.rollout.result import ActLog, Episode, Evaluation, Trial
+from ada_diffuser.session import Session
 
 #: Called with the number of environment steps just made.
 Progress = Callable[[int], object]
