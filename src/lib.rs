@@ -64,6 +64,7 @@
 //! | what was executed, as tokens; a history that outlasts an episode, or is brought along | `model/agent/executed.rs`, [`model::agent::Agent::recall`] |
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
 //! | a session as bytes; an episode that was written down, taken up again | [`serve::session::Record`], [`model::agent::Agent::adopt`] |
+//! | an act that panics, a number that is not finite, a thread that hangs; all of them on demand | [`serve::engine`] (`worker.rs`, `pulse.rs`), `serve/session/poison.rs`, [`model::agent::Place`], [`serve::fault`] |
 //! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |
 //!
 //! # Paper and code
