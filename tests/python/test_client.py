@@ -22,6 +22,7 @@ from ada_diffuser import (
     Observation,
     Overloaded,
     PayloadMismatch,
+    PoisonStep,
     RetryPolicy,
     ServerFault,
     StepConflict,
@@ -105,6 +106,7 @@ def test_a_wait_beyond_the_budget_is_not_begun(client: Client, core: Core) -> No
         (Refusal("STEP_PAYLOAD_MISMATCH", committed_step=7), PayloadMismatch),
         (Refusal("SESSION_NOT_FOUND"), NotFound),
         (Refusal("ENGINE_PANIC", error_id="e-1"), ServerFault),
+        (Refusal("POISON_STEP", error_id="e-2"), PoisonStep),
         (Refusal("TOO_LARGE"), TooLarge),
     ],
 )
