@@ -65,6 +65,7 @@
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
 //! | a session as bytes; an episode that was written down, taken up again | [`serve::session::Record`], [`model::agent::Agent::adopt`] |
 //! | a session that outlives the process: what is written, when, and where | `serve/session/keeping.rs`, `serve/keeper.rs`, [`serve::store`] |
+//! | an act that panics, a number that is not finite, a thread that hangs; all of them on demand | [`serve::engine`] (`worker.rs`, `pulse.rs`), `serve/session/poison.rs`, [`model::agent::Place`], [`serve::fault`] |
 //! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |
 //!
 //! # Paper and code

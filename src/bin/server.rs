@@ -5,6 +5,7 @@ use ada_diffuser::{
     serve::{
         Server,
         config::{Config, ConfigError},
+        fault::{Fault, Faults},
         telemetry,
     },
 };
@@ -38,6 +39,9 @@ struct Flags {
     /// Any setting, e.g. engine.workers=2; may be repeated. Before it count the environment (ADA__ENGINE__WORKERS=2) and the file.
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE", value_parser = key_value)]
     settings: Vec<(String, String)>,
+    /// What is to go wrong, for tests: see docs/reliability.md.
+    #[arg(long = "fault", hide = true, value_name = "POINT=HARM[:MS][@N|@state=VALUE]")]
+    faults: Vec<Fault>,
 }
 
 fn key_value(text: &str) -> Result<(String, String), String> {
@@ -48,13 +52,14 @@ fn key_value(text: &str) -> Result<(String, String), String> {
 impl Flags {
     /// All settings, the named flags last.
     fn config(self) -> Result<Config, ConfigError> {
-        let Self { config, listen, models, store, default_model, mut settings } = self;
+        let Self { config, listen, models, store, default_model, mut settings, faults } = self;
         let named = [("server.listen", listen), ("models.default", default_model)];
         settings.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
         let mut config = Config::load(config.as_deref(), &settings)?;
         // A path need not be text.
         config.models.dir = models.unwrap_or(config.models.dir);
         config.store.dir = store.unwrap_or(config.store.dir);
+        config.faults = Faults::new(&faults);
         Ok(config)
     }
 }
@@ -77,6 +82,9 @@ fn run(flags: Flags) -> anyhow::Result<()> {
     }
     let config = flags.config()?;
     let log = telemetry::install_log(&config.telemetry, io::stderr())?;
+    if config.faults.are_armed() {
+        tracing::warn!("faults are armed (--fault): this server breaks, as it was asked to");
+    }
     let served = serve(config);
     log.end();
     served

@@ -18,6 +18,7 @@ pub(super) struct Count {
 impl Count {
     /// An act has come.
     pub fn new(caller: Caller) -> Self {
+        metrics::counter!("ada_acts_received_total", "face" => caller.face.word()).increment(1);
         Self { arrived: Instant::now(), caller, model: "unknown".to_owned(), is_told: false }
     }
 

@@ -144,6 +144,17 @@ pub enum ServiceError {
         /// To find it in the log.
         id: Uuid,
     },
+    /// Another observation, or a reset: with this one the engine fails, and it was tried twice.
+    #[error(
+        "step {step} was tried twice with this observation, and the engine failed over it both times ({id}): nothing was changed; act with another \
+         observation, or reset the session"
+    )]
+    PoisonStep {
+        /// What was sent.
+        step: u64,
+        /// To find it in the log.
+        id: Uuid,
+    },
     /// Anything else that is our fault.
     #[error("internal error ({id})")]
     Internal {
@@ -237,10 +248,10 @@ impl ServiceError {
             AgentError::InvalidHistory { field, reason } => Self::invalid(field, reason),
             AgentError::InvalidEpisode { field, reason } => Self::invalid(format!("episode.{field}"), reason),
             ref error @ AgentError::HistoryNotKept { field } => Self::invalid(field, error.to_string()),
-            AgentError::NonFinite => {
+            AgentError::NonFinite { place } => {
                 let id = Uuid::new_v4();
-                tracing::error!(%id, "the network's output is not finite");
-                metrics::counter!("ada_nonfinite_total", "where" => "denoiser").increment(1);
+                tracing::error!(%id, %place, "the network's output is not finite");
+                metrics::counter!("ada_nonfinite_total", "where" => place.word()).increment(1);
                 Self::NonFiniteOutput { id }
             }
             error @ AgentError::Tensor(_) => Self::internal(&error),
@@ -273,6 +284,7 @@ impl ServiceError {
             Self::NotReady { .. } => "NOT_READY",
             Self::NonFiniteOutput { .. } => "NONFINITE_OUTPUT",
             Self::EnginePanic { .. } => "ENGINE_PANIC",
+            Self::PoisonStep { .. } => "POISON_STEP",
             Self::Internal { .. } => "INTERNAL",
         }
     }
@@ -313,7 +325,11 @@ impl ServiceError {
     /// To find an internal error in the log.
     pub fn error_id(&self) -> Option<Uuid> {
         match self {
-            Self::NonFiniteOutput { id } | Self::EnginePanic { id } | Self::Internal { id } | Self::StateCorrupt { id } => Some(*id),
+            Self::NonFiniteOutput { id }
+            | Self::EnginePanic { id }
+            | Self::PoisonStep { id, .. }
+            | Self::Internal { id }
+            | Self::StateCorrupt { id } => Some(*id),
             _ => None,
         }
     }
@@ -362,6 +378,7 @@ impl ServiceError {
             (Self::NotReady { retry_after_ms }, 14, 503, "NOT_READY"),
             (Self::NonFiniteOutput { id }, 13, 500, "NONFINITE_OUTPUT"),
             (Self::EnginePanic { id }, 13, 500, "ENGINE_PANIC"),
+            (Self::PoisonStep { step, id }, 9, 422, "POISON_STEP"),
             (Self::Internal { id }, 13, 500, "INTERNAL"),
         ]
     }

@@ -9,6 +9,7 @@ pub mod connections;
 mod count;
 pub mod engine;
 pub mod error;
+pub mod fault;
 pub mod gate;
 pub mod grpc;
 pub mod guard;

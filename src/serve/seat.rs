@@ -5,8 +5,9 @@ use crate::{
     serve::{
         engine::{Failure, Finished, Patience, Ticket},
         error::{ServiceError, Stage},
+        fault::{Faults, Point},
         session::{Answer, Flight, Session, Timings},
-        store::Store,
+        store::{Refused, Store},
     },
 };
 use std::{sync::Arc, time::Instant};
@@ -25,6 +26,10 @@ pub(super) struct Seat {
     pub store: Option<Arc<Store>>,
     /// What its caller is told to wait if it has to leave a full queue.
     pub retry_after_ms: u64,
+    /// What is to go wrong on its way.
+    pub faults: Faults,
+    /// What they know it by.
+    pub first: Option<f32>,
 }
 
 impl Ticket for Seat {
@@ -41,18 +46,19 @@ impl Ticket for Seat {
     }
 
     fn settle(self, outcome: Result<Finished, Failure>) {
-        let Self { session, flight, store: _, retry_after_ms } = &self;
+        let Self { session, flight, store: _, retry_after_ms, .. } = &self;
         match outcome {
             Ok(Finished { episode, chunk, queue, compute, at }) => {
                 let (now, evaluations) = (Instant::now(), chunk.evaluations.into());
                 metrics::counter!("ada_network_evaluations_total", "model" => session.model.to_string()).increment(evaluations);
+                self.reaches(Point::Computed);
                 let timings = Timings { queue, compute, commit: now - at, total: now - flight.arrived };
                 let (model, model_digest) = (session.model.clone(), session.agent.spec().digest.clone());
                 let answer = Answer { session: session.id, step: flight.step, chunk: Arc::new(chunk), timings, model, model_digest };
                 self.commit(Arc::new(episode), Arc::new(answer));
             }
             Err(Failure::Agent(error)) => session.fail(flight, ServiceError::from_agent(error)),
-            Err(Failure::Panic) => self.panicked("the model panicked over an act"),
+            Err(Failure::Panic) => self.poisons(),
             Err(Failure::Late) => session.fail(flight, ServiceError::Deadline { stage: Stage::Queue }),
             Err(Failure::Displaced) => session.fail(flight, ServiceError::QueueFull { retry_after_ms: *retry_after_ms }),
             Err(Failure::Stopped) => session.fail(flight, ServiceError::Draining { retry_after_ms: RETRY_AFTER_RESTART_MS }),
@@ -64,10 +70,10 @@ impl Seat {
     /// Commits before anybody is told: in memory, or, where there is a store, there first.
     fn commit(mut self, episode: Arc<Episode>, answer: Arc<Answer>) {
         // Taken: what waits in the store must not hold the store.
-        let Some(store) = self.store.take() else { return self.session.commit(&self.flight, episode, answer) };
+        let Some(store) = self.store.take() else { return self.stored(episode, answer) };
         match self.session.about_to_commit(&self.flight, &episode, &answer) {
             Ok(Some(write)) => store.submit(write, move |outcome| match outcome {
-                Ok(Ok(())) => self.session.commit(&self.flight, episode, answer),
+                Ok(Ok(())) => self.stored(episode, answer),
                 Ok(Err(refused)) => {
                     self.session.fail(&self.flight, ServiceError::from_refused(refused));
                     self.session.overtaken(refused);
@@ -79,18 +85,37 @@ impl Seat {
         }
     }
 
-    fn panicked(&self, what: &str) {
+    /// The store has it, where there is one.
+    fn stored(&self, episode: Arc<Episode>, answer: Arc<Answer>) {
+        self.reaches(Point::Stored);
+        self.session.commit(&self.flight, episode, answer);
+    }
+
+    fn reaches(&self, point: Point) {
+        self.faults.reach(point, self.first);
+    }
+
+    /// The model panicked over it, and once more when it was alone.
+    fn poisons(&self) {
         let id = Uuid::new_v4();
-        tracing::error!(%id, model = %self.session.model, step = self.flight.step, "{what}");
-        self.session.fail(&self.flight, ServiceError::EnginePanic { id });
+        tracing::error!(%id, model = %self.session.model, step = self.flight.step, "the model panicked twice over an act");
+        self.session.poison(&self.flight, id);
     }
 }
 
-/// An act that was given up half done tells so to whoever waits for it; one that is settled has told already.
+/// An act that was given up half done tells so to whoever waits for it; one that is settled has told already. If it was on its way into the store,
+/// nobody here knows whether it came there: the session leaves memory, so that who asks next finds it as it is kept.
 impl Drop for Seat {
     fn drop(&mut self) {
-        if self.flight.is_wanted() {
-            self.panicked("an act was given up, for a defect of the server");
+        if !self.flight.is_busy() {
+            return;
+        }
+        let (id, is_storing) = (Uuid::new_v4(), self.flight.is_storing());
+        let (model, step) = (&self.session.model, self.flight.step);
+        tracing::error!(%id, %model, step, is_storing, "an act was given up, for a defect of the server");
+        self.session.fail(&self.flight, ServiceError::EnginePanic { id });
+        if is_storing {
+            self.session.overtaken(Refused::Conflict);
         }
     }
 }

@@ -5,8 +5,9 @@ use crate::{
     serve::{
         config::{Config, EngineConfig},
         count::Count,
-        engine::{Engine, EngineOptions, Failure, Job, Patience, Question, Refusal},
+        engine::{Engine, EngineOptions, Failure, Job, Patience, Question, Refusal, Ticket},
         error::{ServiceError, Stage},
+        fault::Point,
         idle::{Idle, until_idle},
         keeper::{Keeper, KeeperError},
         registry::{Model, Registry, RegistryError},
@@ -16,20 +17,23 @@ use crate::{
         telemetry,
     },
 };
-use futures_util::{Stream, StreamExt, future::join_all};
+use futures_util::{FutureExt, Stream, StreamExt, future::join_all};
 use std::{
+    panic::AssertUnwindSafe,
     sync::{
         Arc, OnceLock,
         atomic::{AtomicUsize, Ordering},
     },
     time::{Duration, Instant},
 };
-use tokio::time::timeout_at;
+use tokio::time::{sleep, timeout_at};
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 /// Seeds drawn by the server stay below 2^53, so that every JSON reader keeps them exactly.
 const DRAWN_SEED_BITS: u32 = 53;
+/// From the moment at which a face has an answer to that at which it is on its way, about.
+const TELLING: Duration = Duration::from_millis(2);
 const PAGE_LEN: usize = 100;
 const PAGE_LEN_MAX: usize = 100;
 
@@ -59,11 +63,8 @@ impl Service {
     /// # Errors
     /// If the system gives no threads for the engine, or the store cannot be opened.
     pub fn start(config: Config) -> Result<Self, StartError> {
-        let EngineConfig { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin_ms, wait_ms_max, .. } = config.engine;
-        let [deadline_margin, wait_max] = [deadline_margin_ms, wait_ms_max].map(Duration::from_millis);
-        let options = EngineOptions { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin, wait_max };
         let keeper = Keeper::open_store(&config.sessions, &config.store)?;
-        let engine = Engine::start(options).map_err(StartError::Engine)?;
+        let engine = Engine::start(engine_options(&config.engine), config.faults.clone()).map_err(StartError::Engine)?;
         Ok(Self { config, registry: OnceLock::new(), keeper, engine, draining: CancellationToken::new() })
     }
 
@@ -100,6 +101,7 @@ impl Service {
     /// Refuses new work from now on; what is in flight goes on.
     pub fn drain(&self) {
         self.draining.cancel();
+        self.config.faults.reach(Point::Draining, None);
     }
 
     /// Cancelled when draining begins.
@@ -113,9 +115,10 @@ impl Service {
         self.keeper.stop();
     }
 
-    /// Whether every worker shows signs of life.
+    /// Whether every worker shows signs of life. Where one does not another takes its place, and the service goes on; but what hangs can only be ended
+    /// with the process.
     pub fn is_alive(&self) -> bool {
-        self.engine.heartbeat_age() <= Duration::from_millis(self.config.engine.heartbeat_age_ms_max)
+        self.engine.silent() == 0
     }
 
     /// Whether it takes new work.
@@ -138,6 +141,7 @@ impl Service {
 
     /// House-keeping, to be called every `sessions.reap_interval_ms`.
     pub fn reap(&self) {
+        self.engine.watch();
         self.keeper.reap();
     }
 
@@ -147,6 +151,8 @@ impl Service {
         telemetry::count_left_out();
         metrics::gauge!("ada_queue_depth").set(waiting as f64);
         metrics::gauge!("ada_inflight_acts").set(running as f64);
+        metrics::gauge!("ada_engine_heartbeat_age_seconds").set(self.engine.heartbeat_age().as_secs_f64());
+        metrics::gauge!("ada_engine_workers_silent").set(self.engine.silent() as f64);
         metrics::gauge!("ada_queue_wait_estimate_seconds").set(self.engine.expected_wait().as_secs_f64());
         if let Some(store) = self.keeper.store() {
             metrics::gauge!("ada_store_queue_depth").set(store.waiting() as f64);
@@ -249,7 +255,7 @@ impl Service {
     /// # Errors
     /// Every row of the error table; the session is as before, but see `Deadline`.
     pub async fn act(&self, request: ActRequest) -> Result<Acted, ServiceError> {
-        let mut count = Count::new(request.caller);
+        let (mut count, first) = (Count::new(request.caller), request.observation.state.first().copied());
         let session = match self.registry() {
             Ok(_) => self.session(&request.session_id).await,
             Err(error) => Err(error),
@@ -262,11 +268,26 @@ impl Service {
         let result = match session {
             Ok(session) => {
                 count.of(&session.model);
-                self.act_on(&session, request, count.arrived()).await
+                // In a batch or on a stream a panic would cost the acts of all.
+                let acting = AssertUnwindSafe(self.act_on(&session, request, count.arrived())).catch_unwind().await;
+                acting.unwrap_or_else(|_| Err(ServiceError::internal(&"the way of an act to the engine panicked")))
             }
             Err(error) => Err(error),
         };
+        if result.is_ok() {
+            self.tells(first);
+        }
         count.told(result)
+    }
+
+    /// For faults: the answer of such an act is about to be on its way.
+    fn tells(&self, first: Option<f32>) {
+        if let Some(harm) = self.config.faults.at(Point::Told, first) {
+            tokio::spawn(async move {
+                sleep(TELLING).await;
+                harm.strike(Point::Told);
+            });
+        }
     }
 
     /// ActBatch: each act has its own answer or error, in the order of the acts.
@@ -392,8 +413,10 @@ impl Service {
                 let turn_by = arrived + patience.min(Duration::from_millis(self.config.engine.turn_ms_max));
                 let retry_after_ms = self.config.engine.retry_after_ms;
                 let (flight, store) = (waiter.flight().clone(), self.keeper.store());
-                let seat = Seat { session: session.clone(), flight, store, retry_after_ms };
-                self.submit(seat, Question { episode, observation }, turn_by, caller.client);
+                let question = Question { episode, observation };
+                let (faults, first) = (self.config.faults.clone(), question.first());
+                let seat = Seat { session: session.clone(), flight, store, retry_after_ms, faults, first };
+                self.submit(seat, question, turn_by, caller.client);
                 (waiter, false)
             }
         };
@@ -403,10 +426,15 @@ impl Service {
     /// Checks the question and hands it to the engine; a refusal goes to everyone who waits for it.
     fn submit(&self, seat: Seat, question: Question, turn_by: Instant, client: u64) {
         let agent = seat.session.agent.clone();
-        let act = match question.begin(&agent) {
-            Ok(act) => act,
-            Err(error) => return seat.session.fail(&seat.flight, ServiceError::from_agent(error)),
+        let begun = match question.begin(&agent) {
+            Err(Failure::Panic) => question.begin(&agent),
+            begun => begun,
         };
+        let act = match begun {
+            Ok(act) => act,
+            Err(failure) => return seat.settle(Err(failure)),
+        };
+        self.config.faults.reach(Point::Admitted, question.first());
         let job = Job { agent, question, act, ticket: seat, submitted: Instant::now(), turn_by, client };
         let flight = job.ticket.flight.clone();
         let (refusal, job) = match self.engine.submit(job) {
@@ -457,6 +485,13 @@ impl Service {
         }
         Ok(Duration::from_millis(ttl_ms))
     }
+}
+
+fn engine_options(config: &EngineConfig) -> EngineOptions {
+    let EngineConfig { workers, queue_len_max, queue_bytes_max, batch_len_max, .. } = *config;
+    let times = [config.deadline_margin_ms, config.wait_ms_max, config.heartbeat_age_ms_max];
+    let [deadline_margin, wait_max, silence_max] = times.map(Duration::from_millis);
+    EngineOptions { workers, queue_len_max, queue_bytes_max, batch_len_max, deadline_margin, wait_max, silence_max }
 }
 
 /// The outcome, also one that comes at the very moment of the deadline: what is committed is told.

@@ -15,6 +15,7 @@ use ada_diffuser::model::{
     options::{LatentMode, SamplerOptions},
     trajectory::Layout,
 };
+use ada_diffuser::serve::fault::{Faults, Point};
 use std::{
     alloc::{GlobalAlloc, Layout as Block, System},
     cell::Cell,
@@ -227,5 +228,15 @@ fn a_gradient_allocates_nothing() {
         assert!(asked_during(|| assert!(go(&Ok))) > 0 || batch == 1, "the counter counts");
         (0..3).for_each(|_| assert!(!go(&|result| result.step(8))));
         assert_eq!(asked_during(|| assert!(go(&Ok))), 0);
+    }
+}
+
+/// A point that is reached asks for nothing, armed or not.
+#[test]
+fn a_point_of_no_fault_allocates_nothing() {
+    let armed = Faults::new(&["computed=panic@state=7".parse().unwrap()]);
+    for faults in [Faults::default(), armed] {
+        assert_eq!(asked_during(|| drop(faults.clone())), 0);
+        assert_eq!(asked_during(|| faults.reach(Point::Computed, Some(1.0))), 0);
     }
 }

@@ -27,6 +27,7 @@ CODES = {
     "STEP_OUT_OF_ORDER": (grpc.StatusCode.ABORTED, 409),
     "STEP_PAYLOAD_MISMATCH": (grpc.StatusCode.FAILED_PRECONDITION, 422),
     "ENGINE_PANIC": (grpc.StatusCode.INTERNAL, 500),
+    "POISON_STEP": (grpc.StatusCode.FAILED_PRECONDITION, 422),
     "SESSION_NOT_FOUND": (grpc.StatusCode.NOT_FOUND, 404),
     "STORE_UNAVAILABLE": (grpc.StatusCode.UNAVAILABLE, 503),
     "STORE_FULL": (grpc.StatusCode.RESOURCE_EXHAUSTED, 507),

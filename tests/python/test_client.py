@@ -25,6 +25,7 @@ from ada_diffuser import (
     Observation,
     Overloaded,
     PayloadMismatch,
+    PoisonStep,
     RetryPolicy,
     ServerFault,
     StepConflict,
@@ -123,6 +124,7 @@ def test_a_wish_beyond_the_budget_leaves_time_for_a_last_call(core: Core) -> Non
         (Refusal("STATE_CORRUPT", error_id="e-1"), StateCorrupt),
         (Refusal("STORE_FULL"), StoreFull),
         (Refusal("ENGINE_PANIC", error_id="e-1"), ServerFault),
+        (Refusal("POISON_STEP", error_id="e-2"), PoisonStep),
         (Refusal("TOO_LARGE"), TooLarge),
     ],
 )

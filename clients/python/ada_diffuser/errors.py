@@ -147,6 +147,10 @@ class ServerFault(AdaError):
     """Report `error_id`: nothing was changed. NONFINITE_OUTPUT, ENGINE_PANIC, INTERNAL."""
 
 
+class PoisonStep(AdaError):
+    """The server failed twice over this observation: act with another one, or reset the session. Report `error_id`. POISON_STEP."""
+
+
 class UnexpectedAnswer(AdaError):
     """The answer is none that this server gives: wrong address, or a version that this client does not know."""
 
@@ -180,6 +184,7 @@ _BY_REASON: dict[str, type[AdaError]] = {
     "NONFINITE_OUTPUT": ServerFault,
     "ENGINE_PANIC": ServerFault,
     "INTERNAL": ServerFault,
+    "POISON_STEP": PoisonStep,
 }
 
 _BY_GRPC_CODE: dict[int, type[AdaError]] = {

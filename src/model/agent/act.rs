@@ -7,7 +7,7 @@ use super::{
     chain::Chain,
     episode::Planned,
     restart::{Stored, choose_start},
-    types::Known,
+    types::{Known, Place},
 };
 use crate::model::{
     columns::Columns,
@@ -153,6 +153,11 @@ impl Act {
         let windows =
             self.candidates.capacity() * size_of::<Candidate>() + self.candidates.iter().map(Candidate::size_bytes).sum::<usize>();
         self.episode.size_bytes() + floats + windows + self.anchor.size_bytes()
+    }
+
+    /// Turns what it knows of the present into NaN, as a broken sum within a layer would: a drill, which ends in [`AgentError::NonFinite`].
+    pub fn spoil(&mut self) {
+        self.candidates.iter_mut().for_each(Candidate::spoil);
     }
 
     /// How its chunk is sampled.
@@ -346,7 +351,7 @@ impl Act {
 
     pub(super) fn finish(self, config: &ModelConfig, walk: Walk) -> Result<(Episode, Chunk), AgentError> {
         if self.has_failed() {
-            return Err(AgentError::NonFinite);
+            return Err(AgentError::NonFinite { place: Place::Denoiser });
         }
         let (evaluations, passes) = (self.evaluations(), self.passes());
         let Self { mut candidates, episode, anchor, start, choice, .. } = self;
@@ -375,14 +380,14 @@ impl Act {
             start,
             degraded: descent.is_degraded(),
         };
-        if !chunk.is_finite() {
-            return Err(AgentError::NonFinite);
-        }
+        chunk.check()?;
         let begun = Self::skill_begun(&episode, &chosen, config);
         let planned = Planned::new(descent.known().to_vec(), actions);
         let stored = Stored::new(chosen.into_window(), anchor);
         let after = episode.after(planned, stored, latent);
-        Ok((if let Some((code, steps)) = begun { after.with_skill(code, steps) } else { after }, chunk))
+        let after = if let Some((code, steps)) = begun { after.with_skill(code, steps) } else { after };
+        // What this act does not show the next one would: the noised window that is kept, the belief of its cold start.
+        if after.is_finite() { Ok((after, chunk)) } else { Err(AgentError::NonFinite { place: Place::Episode }) }
     }
 
     /// The code of the skill that this act began, and for how many steps, of a model that has skills. One that a deadline cut short is done

@@ -57,6 +57,11 @@ impl Candidate {
         self.descent.allow(evaluations);
     }
 
+    /// See [`super::Act::spoil`].
+    pub(super) fn spoil(&mut self) {
+        self.descent.spoil();
+    }
+
     /// See [`Descent::begin_cold`].
     pub(super) fn begin_cold(&mut self, walk: Walk) {
         self.descent.begin_cold(walk);

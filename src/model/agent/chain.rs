@@ -1,5 +1,6 @@
 //! The latents of an act in progress, each known from the one before by the prior.
 
+use super::types::are_finite;
 use crate::model::latent::{GaussianRef, LOG_VAR};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -23,8 +24,13 @@ impl Chain {
 
     /// Whether it is one of so many latents of this width, none given out and all of them finite.
     pub(super) fn is_whole(&self, len: usize, dim: usize) -> bool {
-        let values = |values: &[f32]| values.len() == len * dim && values.iter().all(|value| value.is_finite());
-        self.dim == dim && self.first == 0 && values(&self.mean) && values(&self.log_var)
+        let sizes = self.mean.len() == len * dim && self.log_var.len() == len * dim;
+        self.dim == dim && self.first == 0 && sizes && self.is_finite()
+    }
+
+    /// Whether all its numbers are.
+    pub(super) fn is_finite(&self) -> bool {
+        are_finite(&self.mean) && are_finite(&self.log_var)
     }
 
     pub(super) fn size_bytes(&self) -> usize {

@@ -1,6 +1,6 @@
 //! What one episode remembers between acts.
 
-use super::restart::Stored;
+use super::{restart::Stored, types::are_finite};
 use crate::model::{
     columns::Columns,
     config::ModelConfig,
@@ -210,6 +210,15 @@ impl Episode {
         Self { planned: Some(planned), window, latent, ..self }
     }
 
+    /// Whether all that an act has written into it is: the rest was checked when it came.
+    pub(super) fn is_finite(&self) -> bool {
+        let Self { memory, planned, window, latent, skill, seed: _, options: _, time: _, history: _, unread: _ } = self;
+        let planned = planned.iter().flat_map(|planned| planned.actions.iter().chain([&planned.state]));
+        let latent = latent.iter().flat_map(|(mean, log_var)| [mean, log_var]);
+        let rows = planned.chain(latent).chain(skill.iter().map(|skill| &skill.code)).chain([memory]);
+        rows.into_iter().all(|row| are_finite(row)) && window.iter().all(Stored::is_finite)
+    }
+
     /// The same with another skill under way, for so many steps from now on.
     pub(super) fn with_skill(self, code: Vec<f32>, steps: u64) -> Self {
         Self { skill: Some(Skill { code, end: self.time + steps }), ..self }
@@ -285,7 +294,7 @@ impl Episode {
 
 /// So many numbers, all finite.
 fn are(values: &[f32], count: usize) -> bool {
-    values.len() == count && values.iter().all(|value| value.is_finite())
+    values.len() == count && are_finite(values)
 }
 
 fn fits(token: &Token, layout: Layout) -> bool {

@@ -22,7 +22,7 @@ pub use act::Act;
 pub use ask::Ask;
 pub use episode::Episode;
 use types::Known;
-pub use types::{AgentError, Chunk, Executed, Observation, Spec, Start};
+pub use types::{AgentError, Chunk, Executed, Observation, Place, Spec, Start};
 
 use crate::model::{
     Networks,

@@ -1,7 +1,7 @@
 //! Whether the window that an act left is still good: a little surprise is noised away, a great one or another
 //! belief of the latent starts anew.
 
-use super::{Start, chain::Chain};
+use super::{Start, chain::Chain, types::are_finite};
 use crate::model::{
     config::{ModelConfig, Restart},
     diffusion::descent::Window,
@@ -26,6 +26,12 @@ impl Stored {
     /// Its beliefs are part of it.
     pub(super) fn anchor_is_whole(&self, dim: usize) -> bool {
         self.anchor.is_whole(1, dim)
+    }
+
+    /// Whether all its numbers are.
+    pub(super) fn is_finite(&self) -> bool {
+        let Window { x, row: _, predicted_state } = &self.window;
+        are_finite(x) && are_finite(predicted_state) && self.anchor.is_finite()
     }
 
     pub(super) fn window(&self) -> &Window {

@@ -14,6 +14,7 @@ use crate::model::{
 
 mod adopted;
 mod executed;
+mod finite;
 mod guidance;
 mod methods;
 mod recall;

@@ -111,9 +111,21 @@ pub struct Chunk {
 impl Chunk {
     /// Whether all its numbers are.
     pub fn is_finite(&self) -> bool {
+        self.check().is_ok()
+    }
+
+    /// Refuses it for the first of its parts with a number that is not finite.
+    pub(super) fn check(&self) -> Result<(), AgentError> {
         let Self { actions, planned_states, latent_mean, latent_log_var, predicted_state, value, value_spread, .. } = self;
-        let rows = actions.iter().chain(planned_states).chain([latent_mean, latent_log_var, predicted_state]);
-        rows.flatten().chain(value).chain(value_spread).all(|value| value.is_finite())
+        let rows = |rows: &[Vec<f32>]| rows.iter().all(|row| are_finite(row));
+        let parts = [
+            (Place::Latent, are_finite(latent_mean) && are_finite(latent_log_var)),
+            (Place::Value, value.iter().chain(value_spread).all(|value| value.is_finite())),
+            (Place::Actions, rows(actions)),
+            (Place::PlannedStates, rows(planned_states) && are_finite(predicted_state)),
+        ];
+        let broken = parts.into_iter().find(|(_, finite)| !finite);
+        broken.map_or(Ok(()), |(place, _)| Err(AgentError::NonFinite { place }))
     }
 
     /// Whether a model could have said it: rows of its sizes, all numbers finite.
@@ -136,6 +148,48 @@ pub enum Start {
     Warm,
     /// From the window of the act before, noised again by this many rungs.
     Renoised(u32),
+}
+
+/// Where NaN or infinity was found on its way out of an act. Nothing of such an act is kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// The denoiser's estimate of the clean window.
+    Denoiser,
+    /// The latent of the chunk's first step.
+    Latent,
+    /// What candidates are worth.
+    Value,
+    /// Actions.
+    Actions,
+    /// Planned states, the predicted one among them.
+    PlannedStates,
+    /// What the episode keeps for the next act: its window and the belief behind it, the state of a GRU that runs on, a skill.
+    Episode,
+}
+
+impl Place {
+    /// The word in metrics and messages.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Denoiser => "denoiser",
+            Self::Latent => "latent",
+            Self::Value => "value",
+            Self::Actions => "actions",
+            Self::PlannedStates => "planned_states",
+            Self::Episode => "episode",
+        }
+    }
+}
+
+impl std::fmt::Display for Place {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.word())
+    }
+}
+
+/// Whether all numbers are.
+pub(super) fn are_finite(values: &[f32]) -> bool {
+    values.iter().all(|value| value.is_finite())
 }
 
 /// Why an act failed; the episode is untouched in every case.
@@ -183,8 +237,11 @@ pub enum AgentError {
         reason: String,
     },
     /// The network answered with NaN or infinity.
-    #[error("the network's output is not finite")]
-    NonFinite,
+    #[error("the network's output is not finite ({place})")]
+    NonFinite {
+        /// Where it was found.
+        place: Place,
+    },
     /// A tensor operation failed: a defect of the model or the program.
     #[error("tensor: {}", plain(.0))]
     Tensor(candle_core::Error),

@@ -125,6 +125,12 @@ impl Descent {
         self.given.extend_from_slice(given);
     }
 
+    /// What is known of the present turns into NaN, in the window too.
+    pub fn spoil(&mut self) {
+        self.known.fill(f32::NAN);
+        self.x.fill(f32::NAN);
+    }
+
     /// Whether nothing is left to be evaluated.
     pub fn is_done(&self) -> bool {
         self.failed || self.actions_left() == 0

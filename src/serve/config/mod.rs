@@ -6,7 +6,10 @@ mod tests;
 
 pub use layers::Origin;
 
-use crate::{model::nn::Precision, serve::store::Durability};
+use crate::{
+    model::nn::Precision,
+    serve::{fault::Faults, store::Durability},
+};
 use layers::Layers;
 use serde::{Deserialize, Serialize};
 use std::{env, ffi::OsString, net::Ipv6Addr, path::Path, path::PathBuf, thread};
@@ -31,6 +34,9 @@ pub struct Config {
     pub models: ModelsConfig,
     /// What is logged.
     pub telemetry: TelemetryConfig,
+    /// What is to go wrong: for tests alone, and no setting of a file.
+    #[serde(skip)]
+    pub faults: Faults,
 }
 
 /// The process: address, threads, end.
@@ -177,7 +183,8 @@ pub struct EngineConfig {
     pub deadline_margin_ms: u64,
     /// What a refused client is told to wait.
     pub retry_after_ms: u64,
-    /// A worker silent for longer makes `/livez` fail.
+    /// A worker silent for longer makes `/livez` fail, and another one takes its place. One that is busy may be silent for ten times as long as warm-up
+    /// found an evaluation to take, and while nobody has measured it for thirty times this.
     pub heartbeat_age_ms_max: u64,
 }
 

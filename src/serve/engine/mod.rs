@@ -7,24 +7,25 @@
 //! neither sessions nor connections: it gives each outcome to a ticket.
 
 mod cost;
+mod pulse;
 mod queue;
 mod tick;
 mod turns;
 mod worker;
 
-use crate::model::agent::{Act, Agent, AgentError, Chunk, Episode, Observation};
+use crate::{
+    model::agent::{Act, Agent, AgentError, Chunk, Episode, Observation},
+    serve::fault::Faults,
+};
 use cost::{Load, Tariff};
 use parking_lot::Mutex;
 use queue::{Ask, Bounds, Place, Queue};
 use std::{
-    sync::{
-        Arc, Weak,
-        atomic::{AtomicU64, Ordering},
-        mpsc,
-    },
-    thread::JoinHandle,
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{Arc, Weak, mpsc},
     time::{Duration, Instant},
 };
+use worker::Crew;
 
 pub use queue::Refusal;
 
@@ -69,9 +70,14 @@ impl Question {
     /// See [`Agent::begin`].
     ///
     /// # Errors
-    /// If the observation does not fit the model.
-    pub fn begin(&self, agent: &Agent) -> Result<Act, AgentError> {
-        agent.begin(&self.episode, &self.observation)
+    /// If the observation does not fit the model, or it panics over it.
+    pub fn begin(&self, agent: &Agent) -> Result<Act, Failure> {
+        guarded(|| agent.begin(&self.episode, &self.observation))
+    }
+
+    /// What a fault may know it by.
+    pub fn first(&self) -> Option<f32> {
+        self.observation.state.first().copied()
     }
 
     /// Forwards that its act still asks for, if every guess of rows that are evaluated at once is borne out.
@@ -144,7 +150,7 @@ impl<T: Ticket> Waiting<T> {
 /// The engine. Dropping it ends its threads after their current tick.
 pub struct Engine<T: Ticket> {
     shared: Arc<Shared<T>>,
-    threads: Mutex<Vec<JoinHandle<()>>>,
+    crew: Mutex<Crew>,
 }
 
 /// Sizes of an engine.
@@ -162,6 +168,8 @@ pub struct EngineOptions {
     pub deadline_margin: Duration,
     /// An act that would wait for longer is refused, but for one that itself takes longer.
     pub wait_max: Duration,
+    /// A worker that shows no sign of life for longer is lost, but for one whose evaluation takes longer.
+    pub silence_max: Duration,
 }
 
 /// A slow act may wait for as many times as long as it takes in a full batch, whatever `wait_max` says.
@@ -177,9 +185,7 @@ struct Shared<T> {
     tariff: Tariff,
     /// For each worker; None after the end.
     warm_ups: Vec<Mutex<Option<Vec<WarmUp>>>>,
-    epoch: Instant,
-    /// When each worker was last seen, in ms since `epoch`.
-    heartbeats: Vec<AtomicU64>,
+    faults: Faults,
 }
 
 impl<T: Ticket> Engine<T> {
@@ -187,18 +193,17 @@ impl<T: Ticket> Engine<T> {
     ///
     /// # Errors
     /// If the system gives no more threads.
-    pub fn start(options: EngineOptions) -> std::io::Result<Self> {
+    pub fn start(options: EngineOptions, faults: Faults) -> std::io::Result<Self> {
         let workers = options.workers;
         let shared = Arc::new(Shared {
             queue: Queue::new(Bounds { len: options.queue_len_max, bytes: options.queue_bytes_max }, workers),
             options,
             tariff: Tariff::default(),
             warm_ups: (0..workers).map(|_| Mutex::new(Some(Vec::new()))).collect(),
-            epoch: Instant::now(),
-            heartbeats: (0..workers).map(|_| AtomicU64::new(0)).collect(),
+            faults,
         });
-        let threads = (0..workers).map(|index| worker::spawn(shared.clone(), index)).collect::<Result<_, _>>()?;
-        Ok(Self { shared, threads: Mutex::new(threads) })
+        let crew = Mutex::new(Crew::start(&shared)?);
+        Ok(Self { shared, crew })
     }
 
     /// Runs ticks of every batch length on every worker, so that the first acts find memory and code in place, and measures them. Waits
@@ -245,10 +250,24 @@ impl<T: Ticket> Engine<T> {
         self.shared.queue.load()
     }
 
-    /// Time since the most silent worker was seen.
+    /// Time since the most silent worker was seen: an idle one shows itself several times a second, a busy one before each network evaluation.
     pub fn heartbeat_age(&self) -> Duration {
-        let oldest = self.shared.heartbeats.iter().map(|beat| beat.load(Ordering::Relaxed)).min().unwrap_or(0);
-        self.shared.epoch.elapsed().saturating_sub(Duration::from_millis(oldest))
+        self.crew.lock().heartbeat_age()
+    }
+
+    /// Workers that are silent for longer than what they do explains (`silence_max`, or ten times what warm-up promised for an evaluation), those
+    /// whose place was taken among them.
+    pub fn silent(&self) -> usize {
+        self.crew.lock().silent()
+    }
+
+    /// Gives the places of workers that are gone or silent to others; to be called about once a second. What waits is computed by those, and what a
+    /// silent one holds waits for it, until whoever asked leaves.
+    pub fn watch(&self) {
+        let mut crew = self.crew.lock();
+        if !self.shared.queue.is_closed() {
+            crew.watch(&self.shared);
+        }
     }
 
     /// Ends the workers after their current tick; what they still held fails with [`Failure::Stopped`]. Waits for them until `patience` is over.
@@ -257,15 +276,7 @@ impl<T: Ticket> Engine<T> {
             job.ticket.settle(Err(Failure::Stopped));
         }
         self.shared.warm_ups.iter().for_each(|mailbox| *mailbox.lock() = None);
-        let end = Instant::now() + patience;
-        for thread in std::mem::take(&mut *self.threads.lock()) {
-            while !thread.is_finished() && Instant::now() < end {
-                std::thread::sleep(Duration::from_millis(5));
-            }
-            if thread.is_finished() && thread.join().is_err() {
-                tracing::error!("an engine thread ended by panic");
-            }
-        }
+        self.crew.lock().end(patience);
     }
 }
 
@@ -302,8 +313,16 @@ impl<T: Ticket> Shared<T> {
     }
 }
 
-impl<T> Shared<T> {
-    fn beat(&self, index: usize) {
-        self.heartbeats[index].store(self.epoch.elapsed().as_millis() as u64, Ordering::Relaxed);
+/// Runs a piece of the model; a panic is a failure of the act, not of the thread. What it touched is dropped, so no broken state is seen again.
+fn guarded<R>(work: impl FnOnce() -> Result<R, AgentError>) -> Result<R, Failure> {
+    caught(work).map_or(Err(Failure::Panic), |result| result.map_err(Failure::Agent))
+}
+
+/// The same of anything; None: it panicked.
+fn caught<R>(work: impl FnOnce() -> R) -> Option<R> {
+    let done = catch_unwind(AssertUnwindSafe(work)).ok();
+    if done.is_none() {
+        metrics::counter!("ada_engine_panics_total").increment(1);
     }
+    done
 }

@@ -1,13 +1,17 @@
 //! A worker's batch and its tick: one network evaluation shared by all acts that use the same model.
 
 use super::{
-    EngineOptions, Failure, Finished, Job, Patience, Question, Ticket,
+    EngineOptions, Failure, Finished, Job, Patience, Question, Ticket, caught,
     cost::{Costs, Load, Slowness, Tariff},
+    guarded,
+    pulse::Pulse,
     turns::{Part, Turns},
 };
-use crate::model::agent::{Act, Agent, AgentError, Chunk, Episode};
+use crate::{
+    model::agent::{Act, Agent, Chunk, Episode},
+    serve::fault::{Faults, Harm, Point},
+};
 use std::{
-    panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -18,6 +22,8 @@ pub(super) struct Batch<T> {
     groups: Vec<Group<T>>,
     slowness: Slowness,
     turns: Turns,
+    pulse: Arc<Pulse>,
+    faults: Faults,
 }
 
 /// Acts of one model; `acts[i]` belongs to `riders[i]`.
@@ -29,15 +35,17 @@ struct Group<T> {
     riders: Vec<Rider<T>>,
 }
 
-/// What an act in a hurry must know beside its batch.
+/// What an act must know beside its batch: one in a hurry what stands between it and its end, all of them whom to tell before an evaluation.
 #[derive(Clone, Copy)]
-struct Pace {
+struct Pace<'a> {
     /// A tick of the other models' acts, which stand between two of its own.
     others: Duration,
     /// Time kept for what follows the last evaluation.
     margin: Duration,
     /// Rows of a tick.
     rows_max: usize,
+    pulse: &'a Pulse,
+    faults: &'a Faults,
 }
 
 /// In which order acts find room in a tick.
@@ -66,8 +74,10 @@ struct Rider<T> {
 }
 
 impl<T: Ticket> Batch<T> {
-    pub fn new(options: EngineOptions) -> Self {
-        Self { options, groups: Vec::new(), slowness: Slowness::default(), turns: Turns::new(options.batch_len_max) }
+    /// Of a worker with this pulse.
+    pub fn new(options: EngineOptions, pulse: Arc<Pulse>, faults: Faults) -> Self {
+        let turns = Turns::new(options.batch_len_max);
+        Self { options, groups: Vec::new(), slowness: Slowness::default(), turns, pulse, faults }
     }
 
     /// Acts in it.
@@ -87,8 +97,12 @@ impl<T: Ticket> Batch<T> {
     }
 
     /// Takes an act into a batch that will hold so many acts and rows; it takes part from the next tick on. One that would come too late is not
-    /// begun.
+    /// begun. A panic of its ticket is its own.
     pub fn admit(&mut self, job: Job<T>, held: Load, tariff: &Tariff) {
+        apart(|| self.let_in(job, held, tariff));
+    }
+
+    fn let_in(&mut self, job: Job<T>, held: Load, tariff: &Tariff) {
         let Job { agent, question, act, ticket, submitted, turn_by: _, client } = job;
         if !ticket.is_wanted() {
             return;
@@ -128,7 +142,7 @@ impl<T: Ticket> Batch<T> {
         let (part, begin) = (self.turns().part(credit), Instant::now());
         for group in &mut self.groups {
             let others = expected.saturating_sub(group.expected(rows_max));
-            let pace = Pace { others, margin, rows_max };
+            let pace = Pace { others, margin, rows_max, pulse: &self.pulse, faults: &self.faults };
             group.tick(&mut self.slowness, pace, |client| match (self.turns.is_heavy(client), part) {
                 (false, _) => Some(Order::First),
                 (true, Part::All) => Some(Order::Then),
@@ -145,7 +159,7 @@ impl<T: Ticket> Batch<T> {
             group.acts.iter().for_each(count_waste);
             for rider in group.riders {
                 // The one that panicked may do so again when it is dropped.
-                drop(catch_unwind(AssertUnwindSafe(|| drop(rider))));
+                apart(|| drop(rider));
             }
         }
     }
@@ -173,24 +187,26 @@ impl<T: Ticket> Group<T> {
     fn tick(&mut self, slowness: &mut Slowness, pace: Pace, order: impl Fn(u64) -> Option<Order>) {
         self.drop_unwanted();
         self.hurry(slowness, pace);
-        self.harvest();
+        self.harvest(pace);
         let len = self.line_up(pace.rows_max, order);
         if len == 0 {
             return;
         }
         let (begin, expected) = (Instant::now(), self.expected_of(len, pace.rows_max));
-        if advance(&self.agent, &mut self.acts[..len]).is_err() {
+        pace.pulse.evaluates(self.costs.as_ref().map(|_| expected));
+        let questions = self.riders[..len].iter().map(|rider| &rider.question);
+        if advance(&self.agent, &mut self.acts[..len], questions, pace.faults).is_err() {
             // Whose fault it was is unknown, and the acts may be half advanced: each act starts again, alone.
             self.acts.drain(..len).for_each(|act| count_waste(&act));
             for rider in self.riders.drain(..len) {
-                rider.ride_alone(&self.agent, self.costs.as_deref(), pace);
+                apart(|| rider.ride_alone(&self.agent, self.costs.as_deref(), pace));
             }
             return;
         }
         if self.costs.is_some() {
             slowness.note(begin.elapsed(), expected);
         }
-        self.harvest();
+        self.harvest(pace);
     }
 
     /// Brings those that take part to the front, as many as have room in so many rows; how many they are.
@@ -237,7 +253,8 @@ impl<T: Ticket> Group<T> {
                 }
                 Err(_) => {
                     count_waste(&self.acts.swap_remove(i));
-                    self.riders.swap_remove(i).ride_alone(&self.agent, None, pace);
+                    let rider = self.riders.swap_remove(i);
+                    apart(|| rider.ride_alone(&self.agent, None, pace));
                 }
             }
         }
@@ -252,11 +269,14 @@ impl<T: Ticket> Group<T> {
         }
     }
 
-    fn harvest(&mut self) {
+    fn harvest(&mut self, pace: Pace) {
         for i in (0..self.riders.len()).rev() {
             if self.acts[i].is_done() {
-                let act = self.acts.swap_remove(i);
-                self.riders.swap_remove(i).settle(finish(&self.agent, act));
+                let (act, rider) = (self.acts.swap_remove(i), self.riders.swap_remove(i));
+                apart(|| match finish(&self.agent, act) {
+                    Err(Failure::Panic) => rider.ride_alone(&self.agent, self.costs.as_deref(), pace),
+                    finished => rider.settle(finished),
+                });
             }
         }
     }
@@ -281,9 +301,10 @@ impl<T: Ticket> Rider<T> {
         Ok(Hurry::Goes)
     }
 
-    /// The whole act without batch mates, from the beginning: the result is the same, for noise does not depend on the batch.
+    /// The whole act without batch mates, from the beginning: the result is the same, for noise does not depend on the batch. It is its second try
+    /// after a panic, and its last.
     fn ride_alone(self, agent: &Agent, costs: Option<&Costs>, pace: Pace) {
-        let mut act = match guarded(|| self.question.begin(agent)) {
+        let mut act = match self.question.begin(agent) {
             Ok(act) => act,
             Err(failure) => return self.ticket.settle(Err(failure)),
         };
@@ -293,11 +314,13 @@ impl<T: Ticket> Rider<T> {
             }
             let load = Load { acts: 1, rows: act.rows() };
             let hurried = costs.map_or(Ok(Hurry::Goes), |costs| self.hurry(agent, &mut act, (costs, load, 1.0), pace));
+            pace.pulse.evaluates(costs.map(|costs| costs.tick(act.rows(), usize::from(act.evaluations() == 0))));
+            let question = std::iter::once(&self.question);
             let advanced = hurried.and_then(|hurry| match hurry {
                 Hurry::Late => Err(Failure::Late),
                 Hurry::Cut if act.is_done() => Ok(()),
                 // A plan that was cut short may still ask for its actions, or to be chosen: that is answered, and brings it to its end.
-                Hurry::Cut | Hurry::Goes => advance(agent, std::slice::from_mut(&mut act)),
+                Hurry::Cut | Hurry::Goes => advance(agent, std::slice::from_mut(&mut act), question, pace.faults),
             });
             if let Err(failure) = advanced {
                 count_waste(&act);
@@ -318,11 +341,27 @@ impl<T: Ticket> Rider<T> {
 }
 
 /// One evaluation of a batch. Every evaluation is counted here, and once more where it ends: with an act that was computed, or as waste.
-fn advance(agent: &Agent, acts: &mut [Act]) -> Result<(), Failure> {
-    guarded(|| agent.advance(acts))?;
+fn advance<'a>(agent: &Agent, acts: &mut [Act], questions: impl Iterator<Item = &'a Question>, faults: &Faults) -> Result<(), Failure> {
+    guarded(|| {
+        if faults.are_armed() {
+            harm(acts, questions, faults);
+        }
+        agent.advance(acts)
+    })?;
     metrics::counter!("ada_batches_total").increment(1);
     metrics::histogram!("ada_batch_size").record(acts.iter().map(Act::rows).sum::<usize>() as f64);
     Ok(())
+}
+
+/// What faults say becomes of this evaluation.
+fn harm<'a>(acts: &mut [Act], questions: impl Iterator<Item = &'a Question>, faults: &Faults) {
+    for (act, question) in acts.iter_mut().zip(questions) {
+        match faults.at(Point::Evaluating, question.first()) {
+            Some(Harm::Nonfinite) => act.spoil(),
+            Some(harm) => harm.strike(Point::Evaluating),
+            None => {}
+        }
+    }
 }
 
 fn finish(agent: &Agent, act: Act) -> Result<(Episode, Chunk), Failure> {
@@ -348,14 +387,11 @@ fn is_late(patience: Patience, needs: Duration, margin: Duration) -> bool {
     patience.due.is_none() && patience.ends.is_some_and(|ends| Instant::now() + needs + margin > ends)
 }
 
-/// Runs a piece of the model; a panic is a failure of the act, not of the thread. What it touched is dropped, so no broken state is seen again.
-fn guarded<R>(work: impl FnOnce() -> Result<R, AgentError>) -> Result<R, Failure> {
-    match catch_unwind(AssertUnwindSafe(work)) {
-        Ok(result) => result.map_err(Failure::Agent),
-        Err(_) => {
-            metrics::counter!("ada_engine_panics_total").increment(1);
-            Err(Failure::Panic)
-        }
+/// Does what concerns one act. If that panics (a ticket that commits, a log line), the act's ticket is dropped on the way, and tells whoever waits;
+/// its batch mates hear nothing of it.
+fn apart(work: impl FnOnce()) {
+    if caught(work).is_none() {
+        tracing::error!("an inference thread panicked outside of the model; the act is given up");
     }
 }
 

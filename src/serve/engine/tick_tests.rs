@@ -48,8 +48,10 @@ impl Slow {
             batch_len_max: 2,
             deadline_margin: Duration::ZERO,
             wait_max: Duration::ZERO,
+            silence_max: Duration::from_secs(10),
         };
-        let (mut batch, tariff) = (Batch::new(options), Tariff::default());
+        let pulse = Arc::new(Pulse::new(options.silence_max));
+        let (mut batch, tariff) = (Batch::new(options, pulse, Faults::default()), Tariff::default());
         batch.warm_up(&agent, &tariff, || true).unwrap();
         (0..100).for_each(|_| batch.slowness.note(Duration::from_secs(1), Duration::from_millis(1)));
         let (told, outcomes) = mpsc::channel();

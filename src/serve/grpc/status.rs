@@ -11,7 +11,7 @@ pub fn code(error: &ServiceError) -> Code {
     match error {
         ServiceError::Invalid { .. } => Code::InvalidArgument,
         ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } | ServiceError::EpisodeOver { .. } => Code::Aborted,
-        ServiceError::StepPayloadMismatch { .. } => Code::FailedPrecondition,
+        ServiceError::StepPayloadMismatch { .. } | ServiceError::PoisonStep { .. } => Code::FailedPrecondition,
         ServiceError::SessionNotFound
         | ServiceError::SessionExpired
         | ServiceError::SessionEvicted
@@ -59,7 +59,7 @@ mod tests {
             assert_eq!(trailer("ada-committed-step"), error.committed_step().map(|_| "3".to_owned()), "{error:?}");
             assert_eq!(trailer("ada-episode"), error.episode().map(|_| "2".to_owned()), "{error:?}");
             assert_eq!(trailer("grpc-retry-pushback-ms"), error.retry_after_ms().map(|_| "1500".to_owned()), "{error:?}");
-            assert_eq!(trailer("ada-error-id").is_some(), [13, 15].contains(&grpc), "{error:?}");
+            assert_eq!(trailer("ada-error-id").is_some(), [13, 15].contains(&grpc) || reason == "POISON_STEP", "{error:?}");
         }
     }
 }

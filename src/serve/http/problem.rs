@@ -49,7 +49,7 @@ pub fn status(error: &ServiceError) -> StatusCode {
     match error {
         ServiceError::Invalid { .. } => StatusCode::BAD_REQUEST,
         ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } | ServiceError::EpisodeOver { .. } => StatusCode::CONFLICT,
-        ServiceError::StepPayloadMismatch { .. } => StatusCode::UNPROCESSABLE_ENTITY,
+        ServiceError::StepPayloadMismatch { .. } | ServiceError::PoisonStep { .. } => StatusCode::UNPROCESSABLE_ENTITY,
         ServiceError::SessionNotFound | ServiceError::ModelNotFound { .. } => StatusCode::NOT_FOUND,
         ServiceError::SessionExpired | ServiceError::SessionEvicted | ServiceError::ModelGone { .. } => StatusCode::GONE,
         ServiceError::TooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
@@ -156,7 +156,7 @@ mod tests {
             assert_eq!(problem["field"].as_str(), error.field(), "{error:?}");
             assert_eq!(problem["committed_step"].as_u64(), error.committed_step(), "{error:?}");
             assert_eq!(problem["episode"].as_u64(), error.episode(), "{error:?}");
-            assert_eq!(problem.get("error_id").is_some(), http == 500, "{error:?}");
+            assert_eq!(problem.get("error_id").is_some(), http == 500 || reason == "POISON_STEP", "{error:?}");
             let response = Problem::from(&error).into_response();
             assert_eq!(response.status().as_u16(), http);
             assert_eq!(response.headers()["content-type"], "application/problem+json");

@@ -53,7 +53,8 @@ impl Flight {
         self.is_wanted() || self.is_storing() && self.outcome.borrow().is_none()
     }
 
-    fn is_storing(&self) -> bool {
+    /// Whether it is on its way into the store.
+    pub fn is_storing(&self) -> bool {
         self.storing.load(Ordering::Acquire)
     }
 

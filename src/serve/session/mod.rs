@@ -4,6 +4,7 @@ mod flight;
 mod handle;
 mod keeping;
 mod key;
+mod poison;
 mod record;
 mod table;
 mod untold;
@@ -28,6 +29,7 @@ use crate::{
     },
 };
 use parking_lot::Mutex;
+use poison::Poisons;
 use serde::{Deserialize, Serialize};
 use std::{
     collections::VecDeque,
@@ -151,6 +153,8 @@ struct Slot {
     /// Names of the last requests that reset it.
     reset_ids: VecDeque<String>,
     committed: Committed,
+    /// Questions that failed at the next step.
+    poisons: Poisons,
     flight: Option<Arc<Flight>>,
     /// A new episode is on its way into the store.
     resetting: bool,
@@ -232,6 +236,7 @@ impl Session {
             resets,
             reset_ids: reset_ids.into(),
             committed,
+            poisons: Poisons::default(),
             flight: None,
             resetting: false,
             ended: false,
@@ -242,7 +247,7 @@ impl Session {
     /// Takes up a step, of this episode if one is named: replays, joins or leads it, for a caller who has this patience.
     ///
     /// # Errors
-    /// If the episode is over, the step out of order, busy, or known with another observation, or if the session has ended.
+    /// If the episode is over, the step out of order, busy, known with another observation or known to fail with this one, or if the session has ended.
     pub fn enter(
         self: &Arc<Self>,
         (episode, step): (Option<u64>, u64),
@@ -270,6 +275,7 @@ impl Session {
             let busy = slot.flight.as_ref().is_some_and(|flight| flight.is_busy());
             return Err(if busy { ServiceError::SessionBusy { committed } } else { ServiceError::StepOutOfOrder { step, committed } });
         }
+        slot.poisons.check(step, key)?;
         // The keys are compared before anyone joins: a waiter that was dropped here would lock the slot once more, from this thread.
         if let Some(flight) = slot.flight.as_ref().filter(|flight| flight.is_busy()) {
             if flight.key != key {
@@ -299,6 +305,7 @@ impl Session {
             let outcome = if slot.release(flight) && slot.committed.step + 1 == flight.step {
                 self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
                 slot.committed = Committed { step: flight.step, episode, last: Some((flight.key, answer.clone())) };
+                slot.poisons.clear();
                 slot.touched = Instant::now();
                 Ok(answer)
             } else {
@@ -362,6 +369,7 @@ impl Session {
         self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
         (slot.resets, slot.reset_ids) = (standing.resets, standing.reset_ids.into());
         slot.committed = Committed { step: standing.step, episode, last: None };
+        slot.poisons.clear();
     }
 
     /// Idle time to live.

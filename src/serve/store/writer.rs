@@ -6,6 +6,7 @@ use parking_lot::{Condvar, Mutex};
 use std::{
     collections::VecDeque,
     io,
+    panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
     thread::{self, Builder, JoinHandle},
     time::{Duration, Instant},
@@ -162,7 +163,7 @@ fn run(home: &dyn Home, queue: &Queue) {
         };
         let begin = Instant::now();
         queue.health.lock().busy_since = Some(begin);
-        let outcome = home.write(&writes);
+        let outcome = apart(|| home.write(&writes)).unwrap_or_else(|| Err(StoreError::Unavailable("it panicked over a commit".into())));
         queue.health.lock().ended(&outcome);
         metrics::histogram!("ada_store_op_duration_seconds", "op" => "write").record(begin.elapsed().as_secs_f64());
         metrics::histogram!("ada_store_group_size").record(writes.len() as f64);
@@ -184,12 +185,27 @@ fn tell(outcome: Result<Vec<Result<(), Refused>>, StoreError>, told: impl Iterat
         Ok(outcomes) => {
             let conflicts = outcomes.iter().filter(|outcome| **outcome == Err(Refused::Conflict)).count();
             metrics::counter!("ada_store_cas_conflicts_total").increment(conflicts as u64);
-            told.zip(outcomes).for_each(|(told, outcome)| told(Ok(outcome)));
+            told.zip(outcomes).for_each(|(told, outcome)| hear(told, Ok(outcome)));
         }
         Err(error) => {
             metrics::counter!("ada_store_errors_total").increment(1);
             tracing::error!(%error, "nothing could be kept");
-            told.for_each(|told| told(Err(error.clone())));
+            told.for_each(|told| hear(told, Err(error.clone())));
         }
     }
+}
+
+fn hear(told: Told, outcome: Outcome) {
+    // Who panics over it tells whoever waits when it is dropped.
+    let _unheard = apart(|| told(outcome));
+}
+
+/// A panic over one write, or in whoever is told, costs that one: without this thread nothing would ever be kept again, and nobody told.
+fn apart<R>(work: impl FnOnce() -> R) -> Option<R> {
+    let done = catch_unwind(AssertUnwindSafe(work)).ok();
+    if done.is_none() {
+        metrics::counter!("ada_store_errors_total").increment(1);
+        tracing::error!("the store's thread caught a panic");
+    }
+    done
 }

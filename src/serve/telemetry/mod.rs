@@ -36,7 +36,7 @@ pub enum Kind {
 use Kind::{Counter, Gauge, Histogram};
 
 /// Every metric: name, kind, meaning.
-pub const CATALOGUE: [(&str, Kind, &str); 47] = [
+pub const CATALOGUE: [(&str, Kind, &str); 51] = [
     ("ada_build_info", Gauge, "1, labelled by version"),
     ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
     ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
@@ -47,6 +47,7 @@ pub const CATALOGUE: [(&str, Kind, &str); 47] = [
     ("ada_connections_timed_out_total", Counter, "connections closed because they did not speak in time"),
     ("ada_http_requests_total", Counter, "requests of either face, by face, route and status"),
     ("ada_http_request_duration_seconds", Histogram, "until the response head of a request, by face"),
+    ("ada_acts_received_total", Counter, "acts that have come, by face; each ends in ada_acts_total"),
     ("ada_acts_total", Counter, "acts, by model, face and outcome (OK, the error's reason, or CANCELLED: its caller hung up)"),
     ("ada_act_duration_seconds", Histogram, "an act from arrival to answer, by model"),
     ("ada_act_queue_seconds", Histogram, "waiting for a worker"),
@@ -86,8 +87,20 @@ pub const CATALOGUE: [(&str, Kind, &str); 47] = [
     ("ada_state_corrupt_total", Counter, "records that were found damaged"),
     ("ada_recovery_duration_seconds", Histogram, "time to open the store, after a kill too"),
     ("ada_engine_panics_total", Counter, "panics caught in the engine"),
+    ("ada_engine_heartbeat_age_seconds", Gauge, "time since the most silent worker was seen"),
+    (
+        "ada_engine_workers_silent",
+        Gauge,
+        "workers that are silent for longer than what they do explains; only the end of the process ends one that hangs",
+    ),
+    ("ada_engine_workers_replaced_total", Counter, "workers whose place another one took, by reason: ended, silent"),
+    ("ada_poison_steps_total", Counter, "acts over which the engine failed twice, by outcome: found, refused (asked again, and not tried)"),
     ("ada_log_lines_left_out_total", Counter, "log lines that could not be written, or repeated a message too often, by reason"),
-    ("ada_nonfinite_total", Counter, "non-finite network outputs, by place"),
+    (
+        "ada_nonfinite_total",
+        Counter,
+        "acts whose numbers were not finite, by where: denoiser, latent, value, actions, planned_states, episode (what is kept for the next act)",
+    ),
 ];
 
 static LEFT_OUT: LazyLock<Arc<LeftOut>> = LazyLock::new(Arc::default);

@@ -10,21 +10,41 @@ use ada_diffuser::{
         normalizer::Affine,
         options::SamplerOptions,
     },
-    serve::engine::{Engine, EngineOptions, Failure, Finished, Job, Patience, Question, Refusal, Ticket},
+    serve::{
+        engine::{Engine, EngineOptions, Failure, Finished, Job, Patience, Question, Refusal, Ticket},
+        fault::Faults,
+    },
 };
 use std::{
+    panic::panic_any,
     sync::{Arc, mpsc},
     time::{Duration, Instant},
 };
 
-type Outcome = Result<Finished, Failure>;
+pub type Outcome = Result<Finished, Failure>;
 
 /// A ticket that can hold up the worker when its act is taken from the queue.
-struct Seat {
+pub struct Seat {
     outcome: mpsc::Sender<Outcome>,
     gate: Option<mpsc::Receiver<()>>,
     patience: Patience,
-    panics: bool,
+    /// What it panics with when its act is taken.
+    pub panics: Option<Bomb>,
+}
+
+/// A panic that goes off again so many times where it is caught.
+#[derive(Clone, Copy)]
+pub struct Bomb(pub u32);
+
+/// What is thrown: it was copied here, for a drop is what sets it off.
+struct Thrown(Bomb);
+
+impl Drop for Thrown {
+    fn drop(&mut self) {
+        if let Some(left) = self.0.0.checked_sub(1) {
+            panic_any(Thrown(Bomb(left)));
+        }
+    }
 }
 
 impl Ticket for Seat {
@@ -33,7 +53,10 @@ impl Ticket for Seat {
     }
 
     fn start(&self) {
-        assert!(!self.panics, "as a log line once did, when nobody read the log");
+        if let Some(bomb) = self.panics {
+            // As a log line once did, when nobody read the log.
+            panic_any(Thrown(bomb));
+        }
         if let Some(gate) = &self.gate {
             gate.recv().unwrap();
         }
@@ -49,11 +72,11 @@ impl Ticket for Seat {
     }
 }
 
-fn agent(name: &str) -> Arc<Agent> {
+pub fn agent(name: &str) -> Arc<Agent> {
     Arc::new(checkpoint::load(&models_dir().join(name)).unwrap())
 }
 
-fn fresh_agent(adjust: impl FnOnce(&mut ModelConfig)) -> Arc<Agent> {
+pub fn fresh_agent(adjust: impl FnOnce(&mut ModelConfig)) -> Arc<Agent> {
     Arc::new(checkpoint::load(&fresh(adjust).path().join("fresh")).unwrap())
 }
 
@@ -72,7 +95,7 @@ fn inverse(config: &mut ModelConfig) {
 }
 
 /// An act of `asked` that is run on `run_on`.
-fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Receiver<Outcome>) {
+pub fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::Receiver<Outcome>) {
     job_with(asked, run_on, seed, &asked.spec().sampler)
 }
 
@@ -82,21 +105,31 @@ fn job_with(asked: &Agent, run_on: &Arc<Agent>, seed: u64, options: &SamplerOpti
     let question = Question { episode, observation };
     let act = question.begin(asked).unwrap();
     let (outcome, receiver) = mpsc::channel();
-    let ticket = Seat { outcome, gate: None, patience: Patience::default(), panics: false };
+    let ticket = Seat { outcome, gate: None, patience: Patience::default(), panics: None };
     let now = Instant::now();
     (Job { agent: run_on.clone(), question, act, ticket, submitted: now, turn_by: now, client: seed }, receiver)
 }
 
 fn one_worker(batch_len_max: usize) -> Engine<Seat> {
-    Engine::start(EngineOptions {
-        workers: 1,
+    engine(1, batch_len_max, Faults::default())
+}
+
+pub fn engine(workers: usize, batch_len_max: usize, faults: Faults) -> Engine<Seat> {
+    let silence_max = Duration::from_millis(400);
+    engine_of(workers, batch_len_max, silence_max, faults)
+}
+
+pub fn engine_of(workers: usize, batch_len_max: usize, silence_max: Duration, faults: Faults) -> Engine<Seat> {
+    let options = EngineOptions {
+        workers,
         queue_len_max: 64,
         queue_bytes_max: 1 << 20,
         batch_len_max,
         deadline_margin: Duration::ZERO,
         wait_max: Duration::from_secs(60),
-    })
-    .unwrap()
+        silence_max,
+    };
+    Engine::start(options, faults).unwrap()
 }
 
 /// An act of another model makes the shared forward fail; its batch mates are answered as if it had not been there.
@@ -134,7 +167,7 @@ fn a_panic_outside_of_the_model_costs_its_batch_alone() {
     engine.warm_up(&tiny).unwrap();
     for seed in 0..3 {
         let (mut bad, given_up) = job(&tiny, &tiny, seed);
-        bad.ticket.panics = true;
+        bad.ticket.panics = Some(Bomb(0));
         assert!(engine.submit(bad).is_ok());
         assert!(given_up.recv_timeout(Duration::from_secs(20)).is_err(), "its ticket was dropped");
         let (good, outcome) = job(&tiny, &tiny, seed);

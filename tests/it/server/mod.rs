@@ -2,9 +2,11 @@
 
 mod bytes;
 mod counters;
+mod crew;
 mod ends;
 mod engine;
 mod errors;
+mod faults;
 mod frames;
 mod generator;
 mod history;
@@ -161,8 +163,13 @@ impl Drop for Process {
 
 /// `ada-server` as a user starts it, on a free port, ready. Its metrics are its own, while servers of one process share theirs.
 pub async fn start_process(settings: &[&str]) -> (Process, Running) {
+    start_armed(&[], settings).await
+}
+
+/// The same with faults.
+pub async fn start_armed(faults: &[&str], settings: &[&str]) -> (Process, Running) {
     let mut command = binary(settings);
-    command.args(["--listen", "127.0.0.1:0"]);
+    command.args(["--listen", "127.0.0.1:0"]).args(faults.iter().flat_map(|fault| ["--fault", fault]));
     let mut process = Process(command.stderr(Stdio::piped()).spawn().unwrap());
     let mut lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
     let line = lines.by_ref().map(Result::unwrap).find(|line| line.contains("\"listening\"")).expect("it ended before it listened");
