@@ -15,6 +15,7 @@ use crate::model::{
 mod adopted;
 mod executed;
 mod guidance;
+mod haste;
 mod methods;
 mod recall;
 mod running;

@@ -12,7 +12,7 @@ mod tick;
 mod turns;
 mod worker;
 
-use crate::model::agent::{Act, Agent, AgentError, Chunk, Episode, Observation};
+use crate::model::agent::{Act, Agent, AgentError, Chunk, Episode, Haste, Observation};
 use cost::{Load, Tariff};
 use parking_lot::Mutex;
 use queue::{Ask, Bounds, Place, Queue};
@@ -63,6 +63,8 @@ pub struct Question {
     pub episode: Arc<Episode>,
     /// What was seen.
     pub observation: Observation,
+    /// What a deadline made of the act, if one is to be done again that was recorded.
+    pub haste: Option<Haste>,
 }
 
 impl Question {
@@ -71,7 +73,9 @@ impl Question {
     /// # Errors
     /// If the observation does not fit the model.
     pub fn begin(&self, agent: &Agent) -> Result<Act, AgentError> {
-        agent.begin(&self.episode, &self.observation)
+        let mut act = agent.begin(&self.episode, &self.observation)?;
+        self.haste.iter().for_each(|haste| act.repeat(haste.clone()));
+        Ok(act)
     }
 
     /// Forwards that its act still asks for, if every guess of rows that are evaluated at once is borne out.
@@ -105,6 +109,10 @@ pub struct Finished {
     pub episode: Episode,
     /// What to do.
     pub chunk: Chunk,
+    /// What was seen.
+    pub observation: Observation,
+    /// What its deadline made of it.
+    pub haste: Haste,
     /// Time in the queue.
     pub queue: Duration,
     /// Time in the batch.

@@ -36,7 +36,7 @@ pub enum Kind {
 use Kind::{Counter, Gauge, Histogram};
 
 /// Every metric: name, kind, meaning.
-pub const CATALOGUE: [(&str, Kind, &str); 35] = [
+pub const CATALOGUE: [(&str, Kind, &str); 39] = [
     ("ada_build_info", Gauge, "1, labelled by version"),
     ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
     ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
@@ -73,6 +73,14 @@ pub const CATALOGUE: [(&str, Kind, &str); 35] = [
         Counter,
         "sessions ended, by reason: closed, expired, evicted, undone (nobody took the answer of the open)",
     ),
+    ("ada_record_entries_total", Counter, "acts and resets written to recordings"),
+    ("ada_record_bytes_total", Counter, "bytes written to recordings"),
+    (
+        "ada_record_dropped_total",
+        Counter,
+        "acts and resets that are in no recording: record.queue_len_max or record.queue_bytes_max was reached, or nothing could be written",
+    ),
+    ("ada_record_stopped", Gauge, "1 while nothing can be written to record.dir; recording goes on by itself"),
     ("ada_engine_panics_total", Counter, "panics caught in the engine"),
     ("ada_log_lines_left_out_total", Counter, "log lines that could not be written, or repeated a message too often, by reason"),
     ("ada_nonfinite_total", Counter, "non-finite network outputs, by place"),

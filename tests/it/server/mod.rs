@@ -13,6 +13,7 @@ mod late;
 mod lifecycle;
 mod limits;
 mod methods;
+mod recordings;
 mod records;
 mod steps;
 mod store;
@@ -160,7 +161,11 @@ impl Drop for Process {
 
 /// `ada-server` as a user starts it, on a free port, ready. Its metrics are its own, while servers of one process share theirs.
 pub async fn start_process(settings: &[&str]) -> (Process, Running) {
-    let mut command = binary(settings);
+    start_command(binary(settings)).await
+}
+
+/// The same of a command that ends as `ada-server` does.
+async fn start_command(mut command: Command) -> (Process, Running) {
     command.args(["--listen", "127.0.0.1:0"]);
     let mut process = Process(command.stderr(Stdio::piped()).spawn().unwrap());
     let mut lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
