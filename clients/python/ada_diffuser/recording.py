@@ -195,8 +195,11 @@ class _Lane:
             if self._at[0] + 1 != entry["episode"]:
                 self._why = "gap"
                 return
-            self._session.reset(entry["seed"], keep_history=entry["keep_history"])
-            self._at = (entry["episode"], 0)
+            try:
+                self._session.reset(entry["seed"], keep_history=entry["keep_history"])
+                self._at = (entry["episode"], 0)
+            except (InvalidInput, NotFound):
+                self._why = "bad_session"
 
     def act(self, entry: Mapping[str, Any], done: Replay) -> None:
         done.acts += 1

@@ -241,22 +241,21 @@ impl Answer {
             value_spread,
             start,
             degraded,
-        } = chunk.clone();
-        let mut hash = Sha256::new();
-        planned_states.iter().flatten().for_each(|value| hash.update(value.to_le_bytes()));
+        } = chunk;
+        let planned: Vec<u8> = planned_states.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
         Self {
-            actions,
-            latent_mean,
-            latent_log_var,
-            predicted_state,
-            evaluations,
-            passes,
-            value,
-            value_spread,
-            start,
-            degraded,
+            actions: actions.clone(),
+            latent_mean: latent_mean.clone(),
+            latent_log_var: latent_log_var.clone(),
+            predicted_state: predicted_state.clone(),
+            evaluations: *evaluations,
+            passes: *passes,
+            value: *value,
+            value_spread: *value_spread,
+            start: *start,
+            degraded: *degraded,
             planned_len: planned_states.len(),
-            planned_digest: Bytes(hash.finalize().to_vec()),
+            planned_digest: Bytes(Sha256::digest(planned).to_vec()),
         }
     }
 

@@ -92,6 +92,8 @@ struct Work {
     file: Option<Open>,
     /// When the file was begun.
     begun: Instant,
+    /// When nothing could be written last.
+    stopped: Instant,
     /// It is full, and a turn is on its way.
     turns: bool,
     /// Entries that are to be told as lost.
@@ -105,7 +107,7 @@ struct Work {
 impl Work {
     fn new(config: RecordConfig, weights: Precision, recorder: Arc<Recorder>) -> Self {
         let (begun, buffer) = (Instant::now(), Vec::with_capacity(WRITE_LEN));
-        Self { config, weights, recorder, file: None, begun, turns: false, lost: 0, buffer, buffered: 0, told: 0 }
+        Self { config, weights, recorder, file: None, begun, stopped: begun, turns: false, lost: 0, buffer, buffered: 0, told: 0 }
     }
 
     fn run(mut self) {
@@ -119,7 +121,7 @@ impl Work {
             if is_last {
                 return self.end();
             }
-            if self.file.is_none() && self.try_again().is_ok() {
+            if self.file.is_none() && self.stopped.elapsed() >= RETRY && self.try_again().is_ok() {
                 tracing::info!(dir = %self.config.dir.display(), "recording goes on");
             }
         }
@@ -150,8 +152,9 @@ impl Work {
         Ok(())
     }
 
-    /// Begins a file if there is room for more than its beginning.
+    /// Begins a file if there is room for more than its beginning; if not, the next try comes as late.
     fn try_again(&mut self) -> io::Result<()> {
+        self.stopped = Instant::now();
         Open::has_room(&self.config.dir)?;
         self.begin()
     }
@@ -160,7 +163,7 @@ impl Work {
     fn fail(&mut self, error: &io::Error, in_hand: u64) {
         tracing::warn!(dir = %self.config.dir.display(), %error, "recording stopped: nothing can be written; it goes on by itself once that is possible");
         metrics::gauge!("ada_record_stopped").set(1.0);
-        self.file = None;
+        (self.file, self.stopped) = (None, Instant::now());
         let dropped = self.recorder.shut() + in_hand;
         self.lost += std::mem::take(&mut self.told);
         self.buffered = 0;
