@@ -13,6 +13,7 @@ use parking_lot::Mutex;
 use std::{
     fs,
     io::{self, ErrorKind},
+    panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
     thread::{Builder, JoinHandle},
     time::{Duration, Instant},
@@ -60,7 +61,7 @@ impl Writer {
             Err(error) if error.kind() == ErrorKind::StorageFull => work.fail(&error, 0),
             Err(error) => return Err(failed(error)),
         }
-        let thread = Builder::new().name("ada-record".into()).spawn(move || work.run()).map_err(failed)?;
+        let thread = Builder::new().name("ada-record".into()).spawn(move || supervise(work)).map_err(failed)?;
         Ok(Some(Self { recorder, thread: Mutex::new(Some(thread)) }))
     }
 
@@ -72,15 +73,25 @@ impl Writer {
     /// Writes what waits, and ends. Blocks for that time.
     pub fn stop(&self) {
         self.recorder.close();
-        if self.thread.lock().take().is_some_and(|thread| thread.join().is_err()) {
-            tracing::error!("the recording's thread ended by panic");
-        }
+        // A panic in it has been told.
+        let _ended = self.thread.lock().take().map(JoinHandle::join);
     }
 }
 
 impl Drop for Writer {
     fn drop(&mut self) {
         self.stop();
+    }
+}
+
+/// Whatever panics here costs the recording, and nothing else.
+fn supervise(work: Work) {
+    let recorder = work.recorder.clone();
+    if catch_unwind(AssertUnwindSafe(|| work.run())).is_err() {
+        metrics::gauge!("ada_record_stopped").set(1.0);
+        tracing::error!("recording ended, for a defect of the server");
+        // What would come is left out from now on: nobody is there to count it.
+        let _uncounted = recorder.shut();
     }
 }
 

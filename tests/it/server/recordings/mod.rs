@@ -147,6 +147,7 @@ async fn live(server: &Running) -> u64 {
         guidance_scale: Some(0.5),
         candidates: Some(4),
         pick_temperature: Some(0.5),
+        streaming: Some(false),
         latent: Some(pb::LatentMode::Sample as i32),
         ..Default::default()
     };
@@ -287,7 +288,7 @@ fn recordings_of_every_version_replay() {
     for version in format::VERSION_MIN..=format::VERSION {
         let file = Path::new(KEPT).join(format!("v{version}.adar"));
         let report = replay(&Plan { files: vec![file], models: models.clone(), workers: 2, batch: 4 }, |_, _| ()).unwrap();
-        assert!(report.verdict == Verdict::Equal && report.acts >= 30 && report.files[0].degraded > 0, "version {version}: {report}");
+        assert!(report.verdict == Verdict::Equal && report.acts >= 30 && report.files[0].degraded > 1, "version {version}: {report}");
     }
 }
 
@@ -307,11 +308,15 @@ async fn keep_a_recording_of_this_version() {
     agent.reset_session(reset).await.unwrap();
     let fork = pb::ForkSessionRequest { session_id: ids[2].clone(), seed: Some(5), ..Default::default() };
     let fork = agent.fork_session(fork).await.unwrap().into_inner().session.unwrap().session_id;
-    let (new, hurried) = (open(&server, "tiny", 11, Default::default()).await, Some(20));
-    for step in 1..=3 {
+    // In no time at all a window that is there is given out as it is, and one that is not takes a single jump.
+    let cold = pb::SamplerOptions { streaming: Some(false), ..Default::default() };
+    let (new, cold) = (open(&server, "tiny", 11, Default::default()).await, open(&server, "tiny", 12, cold).await);
+    for step in 1..=4 {
         ask(&server, &ids[1], observation(1, step), step, None).await;
         ask(&server, &fork, observation(2, step), step + 4, None).await;
-        ask(&server, &new, observation(2, step), step, hurried.filter(|_| step > 1)).await;
+        for id in [&new, &cold] {
+            ask(&server, id, observation(2, step), step, Some(20).filter(|_| step > 1)).await;
+        }
     }
     end(server).await;
     let kept = Path::new(KEPT).join(format!("v{}.adar", format::VERSION));
