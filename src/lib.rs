@@ -31,7 +31,8 @@
 //!    window itself (zig-zag), and the denoiser ([`model::denoiser`]) takes every window one row down ([`model::diffusion::descent`]), led by a guide
 //!    where it is asked to be ([`model::diffusion::guidance`]). Of a plan of states inverse dynamics ([`model::head`]) make actions.
 //! 5. A finished act is a new episode and a [`model::agent::Chunk`]; the session commits both together, if the step is still the
-//!    same: into the store, where there is one, then in memory. Then the answer goes out.
+//!    same: into the store, where there is one, then in memory. Then the answer goes out. Where acts are recorded ([`serve::recording`]) it is noted at
+//!    the commit, and written by a thread of its own.
 //!
 //! What a model is stands in one struct, [`model::method::Method`], word for word the same in a recipe and in a checkpoint; each choice is a
 //! closed enum. [`model::check`] is the one check of it, for recipes, checkpoints and sessions.
@@ -66,6 +67,7 @@
 //! | a session as bytes; an episode that was written down, taken up again | [`serve::session::Record`], [`model::agent::Agent::adopt`] |
 //! | a session that outlives the process: what is written, when, and where | `serve/session/keeping.rs`, `serve/keeper.rs`, [`serve::store`] |
 //! | an act that panics, a number that is not finite, a thread that hangs; all of them on demand | [`serve::engine`] (`worker.rs`, `pulse.rs`), `serve/session/poison.rs`, [`model::agent::Place`], [`serve::fault`] |
+//! | an act that was recorded, and how it is done again | [`serve::recording`], [`serve::replay`], [`model::agent::Haste`] |
 //! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |
 //!
 //! # Paper and code

@@ -1,17 +1,15 @@
 //! Sessions wherever they are: in memory, and in the store behind it. What changes one of them is kept before it is told; one that is not in memory comes
 //! back when somebody asks for it.
 
-use crate::{
-    model::agent::Episode,
-    serve::{
-        config::{SessionsConfig, StoreConfig},
-        error::ServiceError,
-        registry::Registry,
-        session::{Handle, Kept, Opening, Session, Sessions, Summary, name_of},
-        store::{
-            Change, Durability, Embedded, Ending, Options, Outcome, Place, Refused, Store, StoreError, UnixMs, VERSION_LEN, Version, Write,
-            unix_ms,
-        },
+use crate::serve::{
+    config::{SessionsConfig, StoreConfig},
+    error::ServiceError,
+    recording::Recorder,
+    registry::Registry,
+    session::{Handle, Kept, Opening, Renewal, Session, Sessions, Summary, name_of},
+    store::{
+        Change, Durability, Embedded, Ending, Options, Outcome, Place, Refused, Store, StoreError, UnixMs, VERSION_LEN, Version, Write,
+        unix_ms,
     },
 };
 use parking_lot::Mutex;
@@ -50,6 +48,8 @@ pub struct Keeper {
     tombstone_ttl: Duration,
     /// No session expires for what went by before: the clock may have jumped, and its client could not reach it.
     started: UnixMs,
+    /// Where acts and resets are recorded, if they are.
+    recorder: Option<Arc<Recorder>>,
     /// Where the search for expired sessions stands.
     swept: Mutex<Option<Handle>>,
 }
@@ -68,8 +68,20 @@ impl Keeper {
             config: config.clone(),
             tombstone_ttl: Duration::from_millis(sessions.tombstone_ttl_ms),
             started: unix_ms(),
+            recorder: None,
             swept: Mutex::default(),
         })
+    }
+
+    /// With a recording of what happens to them.
+    #[must_use]
+    pub fn recorded_by(self, recorder: Option<Arc<Recorder>>) -> Self {
+        Self { recorder, ..self }
+    }
+
+    /// Where acts are recorded.
+    pub fn recorder(&self) -> Option<Arc<Recorder>> {
+        self.recorder.clone()
     }
 
     /// Those in memory.
@@ -151,28 +163,24 @@ impl Keeper {
     ///
     /// # Errors
     /// Those of [`Session::begin_reset`]; `StoreFull`, `StoreUnavailable`.
-    pub async fn reset(
-        &self,
-        session: &Arc<Session>,
-        renew: impl FnOnce(&Episode) -> Result<Episode, ServiceError>,
-        ends: Option<u64>,
-        request_id: String,
-    ) -> Result<(), ServiceError> {
-        let Some(reset) = session.begin_reset(renew, ends, request_id, Instant::now())? else { return Ok(()) };
+    pub async fn reset(&self, session: &Arc<Session>, renewal: Renewal, ends: Option<u64>, request_id: String) -> Result<(), ServiceError> {
+        let Some(reset) = session.begin_reset(renewal, ends, request_id, Instant::now())? else { return Ok(()) };
         if self.store.is_none() {
-            session.finish_reset(Some(reset));
+            session.finish_reset(Some(reset), self.recorder.as_deref());
             return Ok(());
         }
         let write = match session.about_to_reset(&reset) {
             Ok(write) => write,
             Err(error) => {
-                session.finish_reset(None);
+                session.finish_reset(None, None);
                 return Err(error);
             }
         };
-        let its = session.clone();
+        let (its, recorder) = (session.clone(), self.recorder.clone());
         // Whoever asked may be gone by then: the writer finishes it.
-        let kept = self.keep(write, move |outcome| its.finish_reset(Some(reset).filter(|_| matches!(outcome, Ok(Ok(())))))).await;
+        let kept = self
+            .keep(write, move |outcome| its.finish_reset(Some(reset).filter(|_| matches!(outcome, Ok(Ok(())))), recorder.as_deref()))
+            .await;
         match kept {
             Ok(Ok(())) => Ok(()),
             Ok(Err(refused)) => {

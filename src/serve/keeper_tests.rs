@@ -81,8 +81,8 @@ async fn memory_that_is_behind_is_found_out() {
     assert_eq!(keeper.table().len(), 1);
     // A reset of the one that is behind finds out as well.
     assert_eq!(keeper.keep(next(&again), |_| ()).await, Ok(Ok(())));
-    let renew = |episode: &Episode| Ok(episode.clone());
-    let refused = keeper.reset(&again, renew, None, String::new()).await.unwrap_err();
+    let renewal = Renewal { seed: 1, keep_history: false };
+    let refused = keeper.reset(&again, renewal, None, String::new()).await.unwrap_err();
     assert_eq!(refused.reason(), "STORE_UNAVAILABLE");
     assert_eq!(keeper.find(session.id, &registry).await.unwrap().summary(Instant::now()).committed_step, 2);
 }

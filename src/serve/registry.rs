@@ -61,6 +61,14 @@ impl Registry {
     /// # Errors
     /// If the directory cannot be read, or no checkpoint or not the default one could be loaded.
     pub fn load(config: &ModelsConfig) -> Result<Self, RegistryError> {
+        Self::load_all(config)?.with_default()
+    }
+
+    /// The same, for whoever always says which model is meant: the default one need not be there.
+    ///
+    /// # Errors
+    /// If the directory cannot be read, or no checkpoint could be loaded.
+    pub fn load_all(config: &ModelsConfig) -> Result<Self, RegistryError> {
         let dirs =
             checkpoint_dirs(&config.dir).map_err(|error| RegistryError::Dir { dir: config.dir.clone(), reason: error.to_string() })?;
         let loaded = dirs.iter().filter_map(|(name, dir)| load_one(name, dir, config.weights)).map(|(name, agent)| {
@@ -71,7 +79,7 @@ impl Registry {
         if models.is_empty() {
             return Err(RegistryError::Empty { dir: config.dir.clone() });
         }
-        Self { models, default: Arc::from(&*config.default) }.with_default()
+        Ok(Self { models, default: Arc::from(&*config.default) })
     }
 
     /// Without the models that do not `work`, which are refused with the reason.

@@ -6,7 +6,8 @@ use crate::{
         engine::{Failure, Finished, Patience, Ticket},
         error::{ServiceError, Stage},
         fault::{Faults, Point},
-        session::{Answer, Flight, Session, Timings},
+        recording::Recorder,
+        session::{Answer, Flight, Session, Taken, Timings},
         store::{Refused, Store},
     },
 };
@@ -24,6 +25,8 @@ pub(super) struct Seat {
     pub flight: Arc<Flight>,
     /// Where commits go first; None: they are in memory alone.
     pub store: Option<Arc<Store>>,
+    /// Where it is recorded, if it is.
+    pub recorder: Option<Arc<Recorder>>,
     /// What its caller is told to wait if it has to leave a full queue.
     pub retry_after_ms: u64,
     /// What is to go wrong on its way.
@@ -46,16 +49,17 @@ impl Ticket for Seat {
     }
 
     fn settle(self, outcome: Result<Finished, Failure>) {
-        let Self { session, flight, store: _, retry_after_ms, .. } = &self;
+        let Self { session, flight, store: _, recorder, retry_after_ms, .. } = &self;
         match outcome {
-            Ok(Finished { episode, chunk, queue, compute, at }) => {
+            Ok(Finished { episode, chunk, observation, haste, queue, compute, at }) => {
                 let (now, evaluations) = (Instant::now(), chunk.evaluations.into());
                 metrics::counter!("ada_network_evaluations_total", "model" => session.model.to_string()).increment(evaluations);
                 self.reaches(Point::Computed);
                 let timings = Timings { queue, compute, commit: now - at, total: now - flight.arrived };
                 let (model, model_digest) = (session.model.clone(), session.agent.spec().digest.clone());
                 let answer = Answer { session: session.id, step: flight.step, chunk: Arc::new(chunk), timings, model, model_digest };
-                self.commit(Arc::new(episode), Arc::new(answer));
+                let taken = recorder.clone().map(|recorder| Taken { recorder, observation, haste });
+                self.commit(Arc::new(episode), Arc::new(answer), taken);
             }
             Err(Failure::Agent(error)) => session.fail(flight, ServiceError::from_agent(error)),
             Err(Failure::Panic) => self.poisons(),
@@ -68,12 +72,12 @@ impl Ticket for Seat {
 
 impl Seat {
     /// Commits before anybody is told: in memory, or, where there is a store, there first.
-    fn commit(mut self, episode: Arc<Episode>, answer: Arc<Answer>) {
+    fn commit(mut self, episode: Arc<Episode>, answer: Arc<Answer>, taken: Option<Taken>) {
         // Taken: what waits in the store must not hold the store.
-        let Some(store) = self.store.take() else { return self.stored(episode, answer) };
+        let Some(store) = self.store.take() else { return self.stored(episode, answer, taken) };
         match self.session.about_to_commit(&self.flight, &episode, &answer) {
             Ok(Some(write)) => store.submit(write, move |outcome| match outcome {
-                Ok(Ok(())) => self.stored(episode, answer),
+                Ok(Ok(())) => self.stored(episode, answer, taken),
                 Ok(Err(refused)) => {
                     self.session.fail(&self.flight, ServiceError::from_refused(refused));
                     self.session.overtaken(refused);
@@ -86,9 +90,9 @@ impl Seat {
     }
 
     /// The store has it, where there is one.
-    fn stored(&self, episode: Arc<Episode>, answer: Arc<Answer>) {
+    fn stored(&self, episode: Arc<Episode>, answer: Arc<Answer>, taken: Option<Taken>) {
         self.reaches(Point::Stored);
-        self.session.commit(&self.flight, episode, answer);
+        self.session.commit(&self.flight, episode, answer, taken);
     }
 
     fn reaches(&self, point: Point) {

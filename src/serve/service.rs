@@ -10,10 +10,11 @@ use crate::{
         fault::Point,
         idle::{Idle, until_idle},
         keeper::{Keeper, KeeperError},
+        recording::{RecordError, Writer},
         registry::{Model, Registry, RegistryError},
         request::{ActRequest, ActResult, Acted, ForkRequest, ImportRequest, ListRequest, OpenRequest, Opened, Page, ResetRequest},
         seat::{RETRY_AFTER_LOADING_MS, RETRY_AFTER_RESTART_MS, Seat},
-        session::{Answer, Entry, Handle, Opening, Record, Session, Standing, Summary, Untold, Waiter, is_request_id, key_of},
+        session::{Answer, Entry, Handle, Opening, Record, Renewal, Session, Standing, Summary, Untold, Waiter, is_request_id, key_of},
         telemetry,
     },
 };
@@ -46,6 +47,9 @@ pub enum StartError {
     /// No place for sessions.
     #[error(transparent)]
     Sessions(#[from] KeeperError),
+    /// No place for recordings.
+    #[error(transparent)]
+    Record(#[from] RecordError),
 }
 
 /// The service: models, sessions and the engine between them.
@@ -54,6 +58,7 @@ pub struct Service {
     registry: OnceLock<Registry>,
     keeper: Keeper,
     engine: Engine<Seat>,
+    recording: Option<Writer>,
     draining: CancellationToken,
 }
 
@@ -61,11 +66,12 @@ impl Service {
     /// A service without models; see [`Service::set_registry`].
     ///
     /// # Errors
-    /// If the system gives no threads for the engine, or the store cannot be opened.
+    /// If the system gives no threads for the engine, or the store cannot be opened, or nothing can be recorded where it should be.
     pub fn start(config: Config) -> Result<Self, StartError> {
-        let keeper = Keeper::open_store(&config.sessions, &config.store)?;
+        let recording = Writer::start(&config.record, config.models.weights)?;
+        let keeper = Keeper::open_store(&config.sessions, &config.store)?.recorded_by(recording.as_ref().map(Writer::recorder));
         let engine = Engine::start(engine_options(&config.engine), config.faults.clone()).map_err(StartError::Engine)?;
-        Ok(Self { config, registry: OnceLock::new(), keeper, engine, draining: CancellationToken::new() })
+        Ok(Self { config, registry: OnceLock::new(), keeper, engine, recording, draining: CancellationToken::new() })
     }
 
     /// Runs each model in every batch length, so that its first act is as fast as any. Blocks for that time. Gives the models back that can
@@ -109,10 +115,11 @@ impl Service {
         &self.draining
     }
 
-    /// Ends the engine, see [`Engine::stop`], and then the store: what is committed is kept.
+    /// Ends the engine, see [`Engine::stop`], and then the store and the recording: what is committed is kept.
     pub fn stop(&self, patience: Duration) {
         self.engine.stop(patience);
         self.keeper.stop();
+        self.recording.iter().for_each(Writer::stop);
     }
 
     /// Whether every worker shows signs of life. Where one does not another takes its place, and the service goes on; but what hangs can only be ended
@@ -330,10 +337,8 @@ impl Service {
         self.registry()?;
         check_request_id(&request_id)?;
         let session = self.session(&session_id).await?;
-        let renew = |episode: &Episode| {
-            session.agent.reset(episode, seed.unwrap_or_else(draw_seed), keep_history).map_err(ServiceError::from_agent)
-        };
-        self.keeper.reset(&session, renew, episode, request_id).await?;
+        let renewal = Renewal { seed: seed.unwrap_or_else(draw_seed), keep_history };
+        self.keeper.reset(&session, renewal, episode, request_id).await?;
         Ok(session.summary(Instant::now()))
     }
 
@@ -412,10 +417,10 @@ impl Service {
                 // Whoever is patient, or names no deadline, has a turn after a while all the same, before those who are in a hurry and came later.
                 let turn_by = arrived + patience.min(Duration::from_millis(self.config.engine.turn_ms_max));
                 let retry_after_ms = self.config.engine.retry_after_ms;
-                let (flight, store) = (waiter.flight().clone(), self.keeper.store());
-                let question = Question { episode, observation };
+                let (flight, store, recorder) = (waiter.flight().clone(), self.keeper.store(), self.keeper.recorder());
+                let question = Question { episode, observation, haste: None };
                 let (faults, first) = (self.config.faults.clone(), question.first());
-                let seat = Seat { session: session.clone(), flight, store, retry_after_ms, faults, first };
+                let seat = Seat { session: session.clone(), flight, store, recorder, retry_after_ms, faults, first };
                 self.submit(seat, question, turn_by, caller.client);
                 (waiter, false)
             }

@@ -34,7 +34,7 @@ from server import BINARY, ROOT
 
 SHORT_FLAGS = {
     "ada-collect": "--episodes 4 --expert-searches 1 --expert-iterations 1",
-    "ada-rollout": "--episodes 2 --episode-steps 12",
+    "ada-rollout": '$([ "$1" = --replay ] || echo --episodes 2 --episode-steps 12)',
     "ada-evaluate": "--episodes 2 --episode-steps 12",
     "ada-suite": "",
 }
@@ -82,6 +82,7 @@ SAYS = {
         "least error of the latent at shift",
         '"evidence":"filter"',
     ],
+    "docs/reliability.md": ["acts, bit for bit, in", "are equal bit for bit, 0 are not"],
     "docs/simulator.md": [
         "data/lift.h5: 100 episodes, 10000 steps; return -9.67 +- 0.36, median -9.03, 0 failed",
         "denoise step 600 of 600",
@@ -155,6 +156,7 @@ class Checkout:
         pid, log = self.folder / "server.pid", self.folder / "server.log"
         self._script(
             built / "ada-server",
+            f'if [ "$1" = replay ]; then exec {BINARY} "$@"; fi\n'
             f"if [ -f {pid} ]; then kill -9 $(cat {pid}); sleep 0.3; fi\n"
             f'ADA__SERVER__LISTEN=127.0.0.1:7777 {BINARY} "$@" >>{log} 2>&1 &\n'
             f"echo $! >{pid}\n"

@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from . import held, hostile, log, memory, newcomer, overload, schema, speed, store
+from . import held, hostile, log, memory, newcomer, overload, recording, schema, speed, store
 from .process import EXTRA, RELEASE, Row
 
 SCENARIOS: dict[str, Callable[[], Iterator[Row]]] = {
@@ -20,6 +20,7 @@ SCENARIOS: dict[str, Callable[[], Iterator[Row]]] = {
     "hostile": hostile.measure,
     "schema": schema.measure,
     "overload": overload.measure,
+    "recording": recording.measure,
     "speed": speed.measure,
     "store": store.measure,
 }

@@ -2,10 +2,12 @@
 //! paper). It works on a copy of the episode: dropping it leaves the old one standing.
 
 use super::{
-    AgentError, Ask, Chunk, Episode, Start,
+    AgentError, Ask, Chunk, Episode, Haste, Start,
     candidate::Candidate,
     chain::Chain,
+    choice::Choice,
     episode::Planned,
+    pace::Pace,
     restart::{Stored, choose_start},
     types::{Known, Place},
 };
@@ -38,16 +40,7 @@ pub struct Act {
     truth: Vec<f32>,
     candidates: Vec<Candidate>,
     choice: Choice,
-}
-
-/// Which candidate it is.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Choice {
-    /// Whether there is nothing left to choose.
-    made: bool,
-    index: usize,
-    /// Its value and the spread of all, standard deviations of the data's returns.
-    worth: Option<(f32, f32)>,
+    pace: Pace,
 }
 
 impl Act {
@@ -85,7 +78,8 @@ impl Act {
             told: told.clone(),
             truth: truth.clone(),
             candidates: (0..candidates).map(candidate).collect(),
-            choice: Choice { made: held || options.candidates == 1 && options.guidance_scale == 0.0, ..Choice::default() },
+            choice: Choice::new(held || options.candidates == 1 && options.guidance_scale == 0.0),
+            pace: Pace::new(),
             episode,
         }
     }
@@ -95,7 +89,7 @@ impl Act {
         match ask {
             Ask::Filter => !self.started,
             Ask::RollOut => self.started && !self.rolled_out && !self.asks(Ask::Refine),
-            Ask::Choose => self.started && !self.choice.made && self.candidates.iter().all(Candidate::is_done) && !self.has_failed(),
+            Ask::Choose => self.started && !self.choice.is_made() && self.candidates.iter().all(Candidate::is_done) && !self.has_failed(),
             Ask::Refine | Ask::Denoise | Ask::Decode => {
                 self.started && self.candidates.iter().any(|window| window.asks(ask, self.options()))
             }
@@ -104,7 +98,7 @@ impl Act {
 
     /// Whether the chunk is ready to be taken by [`super::Agent::finish`].
     pub fn is_done(&self) -> bool {
-        self.has_failed() || self.choice.made && self.candidates.iter().all(Candidate::is_done)
+        self.has_failed() || self.choice.is_made() && self.candidates.iter().all(Candidate::is_done)
     }
 
     fn has_failed(&self) -> bool {
@@ -147,12 +141,41 @@ impl Act {
         self.candidates.iter_mut().for_each(|window| window.allow(evaluations));
     }
 
+    /// To be hurried as an act was that is done again, whatever the clock says and [`Self::allow`] is told: same episode, same observation, same
+    /// haste, same answer.
+    pub fn repeat(&mut self, haste: Haste) {
+        self.pace.repeat(haste);
+    }
+
+    /// What its deadline made of it; asked once, when it is done.
+    pub fn take_haste(&mut self) -> Haste {
+        self.pace.take_haste()
+    }
+
+    /// The pace of the forward that comes: what a deadline makes of it is noted, or done as it was noted.
+    pub(super) fn keep_pace(&mut self) {
+        let left = self.candidates.iter().find(|window| !window.descent().is_done()).and_then(|window| window.descent().allowance());
+        let hurries = self.candidates.iter().any(|window| window.descent().is_hurried());
+        let bound = left.filter(|_| hurries).map(|left| u32::try_from(left).unwrap_or(u32::MAX));
+        let kept = self.pace.settle(self.passes(), bound);
+        if kept != bound {
+            self.allow(kept.map(|left| left as usize));
+        }
+    }
+
+    /// Gives out what it has, if an act did so here that it is to repeat.
+    pub(super) fn cut_again(&mut self, config: &ModelConfig, walk: Walk) {
+        if self.pace.is_to_be_cut(self.passes()) {
+            self.cut_short(config, walk);
+        }
+    }
+
     /// Resident size in bytes, beside its own: the copy of the episode, and the working memory.
     pub fn size_bytes(&self) -> usize {
         let floats = (self.told.capacity() + self.truth.capacity()) * size_of::<f32>();
         let windows =
             self.candidates.capacity() * size_of::<Candidate>() + self.candidates.iter().map(Candidate::size_bytes).sum::<usize>();
-        self.episode.size_bytes() + floats + windows + self.anchor.size_bytes()
+        self.episode.size_bytes() + floats + windows + self.anchor.size_bytes() + self.pace.size_bytes()
     }
 
     /// Turns what it knows of the present into NaN, as a broken sum within a layer would: a drill, which ends in [`AgentError::NonFinite`].
@@ -248,6 +271,7 @@ impl Act {
             if self.candidates.iter().all(empty) {
                 return false;
             }
+            self.pace.cut(self.passes());
             self.candidates.iter_mut().for_each(|window| window.cut_short(walk));
             return true;
         }
@@ -256,6 +280,7 @@ impl Act {
             return false;
         }
         let Some(stored) = self.episode.take_stored() else { return false };
+        self.pace.cut(0);
         (self.started, self.rolled_out, self.start) = (true, true, Start::Warm);
         self.anchor.set(0, stored.anchor());
         for window in &mut self.candidates {
@@ -326,27 +351,10 @@ impl Act {
         }
     }
 
-    /// Takes note of what the candidates are worth, and chooses one: the best, of those that are as good the first; or by chance, each with
-    /// probability `exp(value / temperature)`.
+    /// Takes note of what the candidates are worth, and chooses one.
     pub(super) fn choose(&mut self, values: &[f32]) {
-        let temperature = self.options().pick_temperature;
-        let best = (0..values.len()).fold(0, |best, index| if values[index] > values[best] { index } else { best });
-        let weight = |value: f32| ((value - values[best]) / temperature).exp();
-        let index = if temperature > 0.0 {
-            let all: f32 = values.iter().map(|value| weight(*value)).sum();
-            let mut left = all * Noise::new(self.episode.seed()).uniform(self.episode.time(), Slot::Choice);
-            let passed = |value: &f32| {
-                left -= weight(*value);
-                left < 0.0
-            };
-            values.iter().position(passed).unwrap_or(best)
-        } else {
-            best
-        };
-        let count = values.len() as f32;
-        let mean = values.iter().sum::<f32>() / count;
-        let spread = (values.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / count).sqrt();
-        self.choice = Choice { made: true, index, worth: Some((values[index], spread)) };
+        let (noise, time) = (Noise::new(self.episode.seed()), self.episode.time());
+        self.choice = Choice::among(values, self.options().pick_temperature, || noise.uniform(time, Slot::Choice));
     }
 
     pub(super) fn finish(self, config: &ModelConfig, walk: Walk) -> Result<(Episode, Chunk), AgentError> {
@@ -355,7 +363,7 @@ impl Act {
         }
         let (evaluations, passes) = (self.evaluations(), self.passes());
         let Self { mut candidates, episode, anchor, start, choice, .. } = self;
-        let chosen = candidates.swap_remove(choice.index);
+        let chosen = candidates.swap_remove(choice.index());
         let (normalizer, descent) = (&config.units.normalizer, chosen.descent());
         let actions: Vec<Vec<f32>> = (0..chosen.actions_len()).map(|index| chosen.action(index).to_vec()).collect();
         let positions = descent.planned().chunks(walk.columns.width()).filter(|_| !walk.columns.state.is_empty());
@@ -375,26 +383,18 @@ impl Act {
             predicted_state: normalizer.state.denormalize(descent.predicted_state()),
             evaluations,
             passes,
-            value: choice.worth.map(|(value, _)| raw(value)),
-            value_spread: choice.worth.map(|(_, spread)| raw(spread) - raw(0.0)),
+            value: choice.worth().map(|(value, _)| raw(value)),
+            value_spread: choice.worth().map(|(_, spread)| raw(spread) - raw(0.0)),
             start,
             degraded: descent.is_degraded(),
         };
         chunk.check()?;
-        let begun = Self::skill_begun(&episode, &chosen, config);
+        let begun = if episode.code().is_none() { chosen.skill_begun(config) } else { None };
         let planned = Planned::new(descent.known().to_vec(), actions);
         let stored = Stored::new(chosen.into_window(), anchor);
         let after = episode.after(planned, stored, latent);
         let after = if let Some((code, steps)) = begun { after.with_skill(code, steps) } else { after };
         // What this act does not show the next one would: the noised window that is kept, the belief of its cold start.
         if after.is_finite() { Ok((after, chunk)) } else { Err(AgentError::NonFinite { place: Place::Episode }) }
-    }
-
-    /// The code of the skill that this act began, and for how many steps, of a model that has skills. One that a deadline cut short is done
-    /// once, and no longer.
-    fn skill_begun(episode: &Episode, chosen: &Candidate, config: &ModelConfig) -> Option<(Vec<f32>, u64)> {
-        let (steps, descent) = (config.method.plan.diffused.code_steps()?, chosen.descent());
-        let lasts = if descent.is_degraded() { 1 } else { steps as u64 };
-        episode.code().is_none().then(|| (descent.given(0).to_vec(), lasts))
     }
 }

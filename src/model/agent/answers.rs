@@ -125,6 +125,7 @@ impl Agent {
 
     /// The clean windows, and one row down, or several.
     fn denoise(&self, acts: &mut [Act]) -> Result<()> {
+        acts.iter_mut().filter(|act| act.asks(Ask::Denoise)).for_each(Act::keep_pace);
         let inputs = self.inputs(acts)?;
         let Inputs { x, levels, latents, observed, told } = &inputs;
         let given = Given { latents: latents.as_ref(), observed: observed.as_ref(), told: told.as_ref(), ..Given::levels(levels) };

@@ -3,6 +3,7 @@
 
 use super::{ask::Ask, chain::Chain};
 use crate::model::{
+    config::ModelConfig,
     diffusion::descent::{Descent, Walk, Window},
     latent::GaussianRef,
     noise::Slot,
@@ -220,6 +221,13 @@ impl Candidate {
             out[filled..filled + len].copy_from_slice(&part[..len]);
             filled += len;
         }
+    }
+
+    /// The code of the skill that it begins, and for how many steps, of a model that has skills. One that a deadline cut short is done once, and no longer.
+    pub(super) fn skill_begun(&self, config: &ModelConfig) -> Option<(Vec<f32>, u64)> {
+        let steps = config.method.plan.diffused.code_steps()?;
+        let lasts = if self.descent.is_degraded() { 1 } else { steps as u64 };
+        Some((self.descent.given(0).to_vec(), lasts))
     }
 
     pub(super) fn size_bytes(&self) -> usize {

@@ -8,9 +8,11 @@ mod answers;
 mod ask;
 mod candidate;
 mod chain;
+mod choice;
 mod episode;
 mod executed;
 mod guide;
+mod pace;
 mod restart;
 mod rows;
 mod types;
@@ -22,7 +24,7 @@ pub use act::Act;
 pub use ask::Ask;
 pub use episode::Episode;
 use types::Known;
-pub use types::{AgentError, Chunk, Executed, Observation, Place, Spec, Start};
+pub use types::{AgentError, Chunk, Executed, Haste, Observation, Place, Spec, Start};
 
 use crate::model::{
     Networks,
@@ -238,6 +240,7 @@ impl Agent {
     /// # Errors
     /// [`AgentError::Tensor`] for a defect; an act whose output is not finite fails alone, at [`Agent::finish`].
     pub fn advance(&self, acts: &mut [Act]) -> Result<(), AgentError> {
+        acts.iter_mut().for_each(|act| act.cut_again(&self.config, self.walk()));
         Ok(Ask::ORDER.into_iter().try_for_each(|ask| self.answer(ask, acts))?)
     }
 

@@ -16,6 +16,7 @@ mod adopted;
 mod executed;
 mod finite;
 mod guidance;
+mod haste;
 mod methods;
 mod recall;
 mod running;

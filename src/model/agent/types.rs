@@ -55,7 +55,8 @@ impl Observation {
 }
 
 /// What the client saw since its last act, raw units.
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Observation {
     /// The current state s_tau.
     pub state: Vec<f32>,
@@ -69,7 +70,8 @@ pub struct Observation {
 }
 
 /// One executed step; what is missing is masked.
-#[derive(Clone, Debug, PartialEq, Default)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Executed {
     /// The state in which it was executed; for the first one of an act the last observation is known and used when this is missing.
     pub state: Option<Vec<f32>>,
@@ -136,6 +138,29 @@ impl Chunk {
         let latents = [latent_mean, latent_log_var].into_iter().all(|values| none_or(values, spec.latent_dim));
         let states = rows(planned_states, spec.layout.state_dim) && none_or(predicted_state, spec.layout.state_dim);
         rows(actions, spec.layout.action_dim) && states && latents && self.is_finite()
+    }
+}
+
+/// What a deadline made of an act. Beside the episode and the observation it is all that an answer depends on: see [`super::Act::repeat`].
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Haste {
+    /// `(forward, left)`: from this forward of the denoiser on (the first is 0) so many were left to it, that one included and each one fewer than
+    /// the one before; None: as many as it asked for. In order of forwards.
+    pub bounds: Vec<(u32, Option<u32>)>,
+    /// Before this forward it gave out what it had.
+    pub cut: Option<u32>,
+}
+
+impl Haste {
+    /// Whether it was in none.
+    pub fn is_none(&self) -> bool {
+        self.bounds.is_empty() && self.cut.is_none()
+    }
+
+    /// Resident size in bytes, beside its own.
+    pub fn size_bytes(&self) -> usize {
+        self.bounds.capacity() * size_of::<(u32, Option<u32>)>()
     }
 }
 

@@ -17,7 +17,7 @@ impl Descent {
             }
         }
         let borne_out = accepted.unwrap_or(slots);
-        let needed = self.allowance.map_or(1, |passes| self.rows_left(top).div_ceil(passes)).min(slots);
+        let needed = self.rows_needed(top, slots);
         self.degraded |= needed > borne_out;
         let accepted = borne_out.max(needed);
         // The estimate from which the window came to where it stands now.

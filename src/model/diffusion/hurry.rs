@@ -10,6 +10,22 @@ impl Descent {
         self.allowance = evaluations.map(|evaluations| evaluations.max(1));
     }
 
+    /// Forwards that it may still take, the coming one included.
+    pub fn allowance(&self) -> Option<usize> {
+        self.allowance
+    }
+
+    /// Whether that bound makes the coming forward go farther than it would without.
+    pub fn is_hurried(&self) -> bool {
+        let farther = |slots: usize| if slots > 1 { self.rows_needed(self.row, slots) > 1 } else { self.rows_at_once() > 1 };
+        !self.is_done() && self.allowance.is_some() && farther(self.slots())
+    }
+
+    /// Rows that a forward from this one has to go down, of `slots` that are evaluated at once.
+    pub(super) fn rows_needed(&self, row: usize, slots: usize) -> usize {
+        self.allowance.map_or(1, |passes| self.rows_left(row).div_ceil(passes)).min(slots)
+    }
+
     /// Forwards that the table still asks for, if no guess is borne out.
     pub fn evaluations_left(&self) -> usize {
         self.rows_left(self.row)

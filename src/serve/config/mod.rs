@@ -1,10 +1,12 @@
 //! Every setting of the server, read once: file, then environment (`ADA__SECTION__KEY`), then flags; `deploy/server.toml` lists them all.
 
 mod layers;
+mod record;
 #[cfg(test)]
 mod tests;
 
 pub use layers::Origin;
+pub use record::RecordConfig;
 
 use crate::{
     model::nn::Precision,
@@ -28,6 +30,8 @@ pub struct Config {
     pub sessions: SessionsConfig,
     /// Where sessions outlive the process.
     pub store: StoreConfig,
+    /// Recordings of acts.
+    pub record: RecordConfig,
     /// The threads that run the networks.
     pub engine: EngineConfig,
     /// The checkpoints.
@@ -434,12 +438,14 @@ impl Config {
         let deadlines = self.limits.act_deadline_ms <= self.limits.act_deadline_ms_max;
         let margin = self.engine.deadline_margin_ms < self.limits.act_deadline_ms;
         range("engine.deadline_margin_ms", margin, "must be below limits.act_deadline_ms")?;
+        let record = &self.record;
+        range("record.dir_bytes_max", record.dir_bytes_max / 2 >= record.file_bytes_max, "must be at least twice record.file_bytes_max")?;
         range("limits.act_deadline_ms", deadlines, "must be at most limits.act_deadline_ms_max")?;
         Ok(self)
     }
 
     /// Settings that make no sense as 0.
-    fn positive(&self) -> [(&'static str, u64); 34] {
+    fn positive(&self) -> [(&'static str, u64); 37] {
         let (connection, limits, sessions, store, engine) = (&self.connection, &self.limits, &self.sessions, &self.store, &self.engine);
         [
             ("server.connections_max", self.server.connections_max as u64),
@@ -470,6 +476,9 @@ impl Config {
             ("store.cache_bytes", store.cache_bytes as u64),
             ("store.queue_len_max", store.queue_len_max as u64),
             ("store.sweep_len", store.sweep_len as u64),
+            ("record.file_bytes_max", self.record.file_bytes_max),
+            ("record.queue_len_max", self.record.queue_len_max as u64),
+            ("record.queue_bytes_max", self.record.queue_bytes_max as u64),
             ("engine.queue_len_max", engine.queue_len_max as u64),
             ("engine.queue_bytes_max", engine.queue_bytes_max as u64),
             ("engine.wait_ms_max", engine.wait_ms_max),

@@ -14,7 +14,7 @@ mod turns;
 mod worker;
 
 use crate::{
-    model::agent::{Act, Agent, AgentError, Chunk, Episode, Observation},
+    model::agent::{Act, Agent, AgentError, Chunk, Episode, Haste, Observation},
     serve::fault::Faults,
 };
 use cost::{Load, Tariff};
@@ -64,6 +64,8 @@ pub struct Question {
     pub episode: Arc<Episode>,
     /// What was seen.
     pub observation: Observation,
+    /// What a deadline made of the act, if one is to be done again that was recorded.
+    pub haste: Option<Haste>,
 }
 
 impl Question {
@@ -72,7 +74,9 @@ impl Question {
     /// # Errors
     /// If the observation does not fit the model, or it panics over it.
     pub fn begin(&self, agent: &Agent) -> Result<Act, Failure> {
-        guarded(|| agent.begin(&self.episode, &self.observation))
+        let mut act = guarded(|| agent.begin(&self.episode, &self.observation))?;
+        self.haste.iter().for_each(|haste| act.repeat(haste.clone()));
+        Ok(act)
     }
 
     /// What a fault may know it by.
@@ -111,6 +115,10 @@ pub struct Finished {
     pub episode: Episode,
     /// What to do.
     pub chunk: Chunk,
+    /// What was seen.
+    pub observation: Observation,
+    /// What its deadline made of it.
+    pub haste: Haste,
     /// Time in the queue.
     pub queue: Duration,
     /// Time in the batch.

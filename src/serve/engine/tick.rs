@@ -8,7 +8,7 @@ use super::{
     turns::{Part, Turns},
 };
 use crate::{
-    model::agent::{Act, Agent, Chunk, Episode},
+    model::agent::{Act, Agent, Chunk, Episode, Haste},
     serve::fault::{Faults, Harm, Point},
 };
 use std::{
@@ -330,13 +330,14 @@ impl<T: Ticket> Rider<T> {
         self.settle(finish(agent, act));
     }
 
-    fn settle(self, finished: Result<(Episode, Chunk), Failure>) {
+    fn settle(self, finished: Result<(Episode, Chunk, Haste), Failure>) {
         let (at, queue) = (Instant::now(), self.started - self.submitted);
         let compute = at - self.started;
-        if finished.as_ref().is_ok_and(|(_, chunk)| chunk.degraded) {
+        if finished.as_ref().is_ok_and(|(_, chunk, _)| chunk.degraded) {
             metrics::counter!("ada_degraded_total").increment(1);
         }
-        self.ticket.settle(finished.map(|(episode, chunk)| Finished { episode, chunk, queue, compute, at }));
+        let observation = self.question.observation;
+        self.ticket.settle(finished.map(|(episode, chunk, haste)| Finished { episode, chunk, observation, haste, queue, compute, at }));
     }
 }
 
@@ -364,9 +365,10 @@ fn harm<'a>(acts: &mut [Act], questions: impl Iterator<Item = &'a Question>, fau
     }
 }
 
-fn finish(agent: &Agent, act: Act) -> Result<(Episode, Chunk), Failure> {
-    let evaluations = act.evaluations();
-    guarded(|| agent.finish(act)).inspect_err(|_| waste(evaluations))
+fn finish(agent: &Agent, mut act: Act) -> Result<(Episode, Chunk, Haste), Failure> {
+    let (evaluations, haste) = (act.evaluations(), act.take_haste());
+    let finished = guarded(|| agent.finish(act)).inspect_err(|_| waste(evaluations));
+    finished.map(|(episode, chunk)| (episode, chunk, haste))
 }
 
 fn count_waste(act: &Act) {

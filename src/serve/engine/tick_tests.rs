@@ -63,6 +63,7 @@ impl Slow {
         let question = Question {
             episode: Arc::new(self.agent.open(1, &self.agent.spec().sampler).unwrap()),
             observation: Observation { state: vec![0.1; 4], ..Observation::default() },
+            haste: None,
         };
         let act = question.begin(&self.agent).unwrap();
         let needs = self.tariff.of(&self.agent).unwrap().act(act.evaluations_left(), ALONE);
@@ -109,7 +110,8 @@ fn rows_and_forwards_are_counted() {
     let options = SamplerOptions { picard_window: 4, streaming: false, ..agent.spec().sampler.clone() };
     let act = |options: &SamplerOptions| {
         let episode = Arc::new(agent.open(1, options).unwrap());
-        let question = Question { episode, observation: Observation { state: vec![0.1; 4], ..Observation::default() } };
+        let observation = Observation { state: vec![0.1; 4], ..Observation::default() };
+        let question = Question { episode, observation, haste: None };
         (question.begin(&agent).unwrap(), question)
     };
     let (wide, question) = act(&options);

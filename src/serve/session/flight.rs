@@ -184,7 +184,7 @@ mod tests {
         model::{agent::Observation, checkpoint},
         serve::{
             config::SessionsConfig,
-            session::{Answer, Entry, Opening, Sessions, Standing, Timings, key_of},
+            session::{Answer, Entry, Opening, Renewal, Sessions, Standing, Timings, key_of},
         },
     };
     use std::{path::Path, thread, time::Duration};
@@ -228,15 +228,16 @@ mod tests {
                 threads.spawn(|| {
                     let after = after.clone();
                     meet(turn % 8 * 2_000);
-                    session.commit(&flight, Arc::new(after), Arc::new(answer));
+                    session.commit(&flight, Arc::new(after), Arc::new(answer), None);
                 });
                 meet(turn % 100);
                 waiter.give_up()
             });
             assert_eq!(late.is_some(), session.summary(Instant::now()).committed_step == 1);
             *if late.is_some() { &mut told } else { &mut silent } += 1;
-            let reset = session.begin_reset(|_| Ok(episode.clone()), None, String::new(), Instant::now()).unwrap();
-            session.finish_reset(reset);
+            let renewal = Renewal { seed: 1, keep_history: false };
+            let reset = session.begin_reset(renewal, None, String::new(), Instant::now()).unwrap();
+            session.finish_reset(reset, None);
         }
         assert!(told > 0 && silent > 0, "both orders occur: {told}, {silent}");
     }

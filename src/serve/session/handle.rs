@@ -1,12 +1,14 @@
 //! What a session is called in public.
 
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::fmt;
 use uuid::{Builder, Uuid};
 
 /// The name under which lists show a session. It is made one way from the id, so whoever knows the id finds its session in a list, and whoever
 /// has read a list cannot act. The table knows sessions by it alone: their order, and with it the token of a page, tells nothing of ids.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
 pub struct Handle(Uuid);
 
 impl Handle {

@@ -7,6 +7,7 @@ mod key;
 mod poison;
 mod record;
 mod table;
+mod taping;
 mod untold;
 
 pub use flight::{Flight, Waiter};
@@ -15,6 +16,7 @@ pub use keeping::name_of;
 pub use key::{Key, key_of};
 pub use record::{Kept, Last, Record, Unreadable};
 pub use table::Sessions;
+pub use taping::Taken;
 pub use untold::Untold;
 
 use crate::{
@@ -25,6 +27,7 @@ use crate::{
     serve::{
         engine::Patience,
         error::ServiceError,
+        recording::{Mark, Recorder},
         store::{UnixMs, Version, unix_ms},
     },
 };
@@ -116,9 +119,19 @@ pub struct Standing {
     pub last: Option<Last>,
 }
 
+/// What a new episode is made with.
+#[derive(Clone, Copy, Debug)]
+pub struct Renewal {
+    /// Its seed.
+    pub seed: u64,
+    /// Whether the latent goes on looking back on the one before.
+    pub keep_history: bool,
+}
+
 /// A new episode that is about to begin.
 pub struct Reset {
     from: Version,
+    renewal: Renewal,
     episode: Arc<Episode>,
     standing: Standing,
 }
@@ -159,6 +172,8 @@ struct Slot {
     /// A new episode is on its way into the store.
     resetting: bool,
     ended: bool,
+    /// Where it stands in the recording, if there is one.
+    mark: Mark,
 }
 
 /// What the last commit left: the episode and, but for a fresh one, the answer with the key of its question.
@@ -240,6 +255,7 @@ impl Session {
             flight: None,
             resetting: false,
             ended: false,
+            mark: Mark::default(),
         };
         Self { id, handle: Handle::of(id), model, agent, options, request_id, ttl, opened, bytes_total, slot: Mutex::new(slot) }
     }
@@ -298,14 +314,19 @@ impl Session {
         (!slot.ended && step == slot.committed.step && *last_key == key).then(|| answer.clone())
     }
 
-    /// Commits the episode and the answer together, if the flight is still the session's; a flight that was dropped meanwhile changes nothing.
-    pub fn commit(&self, flight: &Arc<Flight>, episode: Arc<Episode>, answer: Arc<Answer>) {
+    /// Commits the episode and the answer together, if the flight is still the session's, and takes down what is recorded of it; a flight that was
+    /// dropped meanwhile changes nothing.
+    pub fn commit(&self, flight: &Arc<Flight>, episode: Arc<Episode>, answer: Arc<Answer>, taken: Option<Taken>) {
         {
             let mut slot = self.slot.lock();
             let outcome = if slot.release(flight) && slot.committed.step + 1 == flight.step {
                 self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
-                slot.committed = Committed { step: flight.step, episode, last: Some((flight.key, answer.clone())) };
+                let committed = Committed { step: flight.step, episode, last: Some((flight.key, answer.clone())) };
+                let before = std::mem::replace(&mut slot.committed, committed);
                 slot.poisons.clear();
+                if let Some(taken) = taken {
+                    self.take_down(&mut slot, &before, taken);
+                }
                 slot.touched = Instant::now();
                 Ok(answer)
             } else {
@@ -327,10 +348,10 @@ impl Session {
     /// request that has reset the session already does not do so again: a copy that came late once undid 24 committed acts.
     ///
     /// # Errors
-    /// If the episode is over, while an act is in flight, or after the end; and those of `renew`.
+    /// If the episode is over, while an act is in flight, or after the end; and those of [`Agent::reset`].
     pub fn begin_reset(
         &self,
-        renew: impl FnOnce(&Episode) -> Result<Episode, ServiceError>,
+        renewal: Renewal,
         ends: Option<u64>,
         request_id: String,
         now: Instant,
@@ -347,7 +368,8 @@ impl Session {
         if slot.resetting || slot.flight.as_ref().is_some_and(|flight| flight.is_busy()) {
             return Err(ServiceError::SessionBusy { committed: slot.committed.step });
         }
-        let episode = Arc::new(renew(&slot.committed.episode)?);
+        let Renewal { seed, keep_history } = renewal;
+        let episode = self.agent.reset(&slot.committed.episode, seed, keep_history).map_err(ServiceError::from_agent)?;
         let from = self.version(&slot);
         slot.resetting = true;
         slot.flight = None;
@@ -355,21 +377,26 @@ impl Session {
         remember(&mut reset_ids, request_id);
         Ok(Some(Reset {
             from,
-            episode,
+            renewal,
+            episode: Arc::new(episode),
             standing: Standing { resets: slot.resets + 1, reset_ids: reset_ids.into(), ..Standing::default() },
         }))
     }
 
-    /// Finishes it; None: it could not be kept, and the session stands where it stood.
-    pub fn finish_reset(&self, reset: Option<Reset>) {
+    /// Finishes it, and takes down what is recorded of it; None: it could not be kept, and the session stands where it stood.
+    pub fn finish_reset(&self, reset: Option<Reset>, recorder: Option<&Recorder>) {
         let mut slot = self.slot.lock();
         slot.resetting = false;
         slot.touched = Instant::now();
-        let Some(Reset { from: _, episode, standing }) = reset.filter(|_| !slot.ended) else { return };
+        let Some(Reset { from: _, renewal, episode, standing }) = reset.filter(|_| !slot.ended) else { return };
         self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
         (slot.resets, slot.reset_ids) = (standing.resets, standing.reset_ids.into());
-        slot.committed = Committed { step: standing.step, episode, last: None };
+        let committed = Committed { step: standing.step, episode, last: None };
+        let before = std::mem::replace(&mut slot.committed, committed);
         slot.poisons.clear();
+        if let Some(recorder) = recorder {
+            self.take_down_reset(&mut slot, &before, renewal, recorder);
+        }
     }
 
     /// Idle time to live.

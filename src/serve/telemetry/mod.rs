@@ -36,7 +36,7 @@ pub enum Kind {
 use Kind::{Counter, Gauge, Histogram};
 
 /// Every metric: name, kind, meaning.
-pub const CATALOGUE: [(&str, Kind, &str); 51] = [
+pub const CATALOGUE: [(&str, Kind, &str); 56] = [
     ("ada_build_info", Gauge, "1, labelled by version"),
     ("ada_model_info", Gauge, "1 for each loaded model, labelled by name and digest"),
     ("ada_checkpoint_rejected_total", Counter, "checkpoints that were not loaded"),
@@ -86,6 +86,14 @@ pub const CATALOGUE: [(&str, Kind, &str); 51] = [
     ("ada_store_cas_conflicts_total", Counter, "commits refused because the store had gone on"),
     ("ada_state_corrupt_total", Counter, "records that were found damaged"),
     ("ada_recovery_duration_seconds", Histogram, "time to open the store, after a kill too"),
+    ("ada_record_entries_total", Counter, "acts and resets written to recordings"),
+    ("ada_record_bytes_total", Counter, "bytes written to recordings"),
+    (
+        "ada_record_dropped_total",
+        Counter,
+        "acts and resets that are in no recording: record.queue_len_max or record.queue_bytes_max was reached, or nothing could be written",
+    ),
+    ("ada_record_stopped", Gauge, "1 while nothing can be written to record.dir; recording goes on by itself"),
     ("ada_engine_panics_total", Counter, "panics caught in the engine"),
     ("ada_engine_heartbeat_age_seconds", Gauge, "time since the most silent worker was seen"),
     (

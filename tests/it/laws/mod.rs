@@ -94,8 +94,11 @@ fn the_network_and_the_clock_stay_with_the_server() {
 #[test]
 fn wire_types_stay_in_their_face() {
     hold(&["pb", "include_proto"], &["serve/grpc/"]);
-    hold(&["serde_json"], &["serve/http/", "model/checkpoint", "train/", "bin/trainer.rs", "model/agent/tests/adopted.rs"]);
-    hold(&["rmp_serde"], &["serve/session/record.rs"]);
+    hold(
+        &["serde_json"],
+        &["serve/http/", "serve/replay/", "model/checkpoint", "train/", "bin/trainer.rs", "model/agent/tests/adopted.rs"],
+    );
+    hold(&["rmp_serde"], &["serve/session/record.rs", "serve/recording/"]);
     // A session's options are written once, with what JSON says of them: a list for each face was one more place to forget an option in.
     hold(&["ToSchema", "utoipa"], &["serve/http/", "serve/options.rs"]);
 }

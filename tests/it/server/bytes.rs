@@ -7,7 +7,7 @@ const STEPS: u64 = 4;
 
 /// What was seen and done at a step, different for every seed and step; every kind of missing part occurs, and so do acts in the place of
 /// the one before.
-fn observation(seed: usize, step: u64) -> pb::Observation {
+pub fn observation(seed: usize, step: u64) -> pb::Observation {
     let wave = |i: usize| ((seed * 31 + step as usize * 7 + i * 3) as f32 * 0.37).sin();
     let vector = |from: usize, len: usize| pb::Vector { values: (from..from + len).map(wave).collect() };
     let executed = pb::Executed {

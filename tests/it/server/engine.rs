@@ -102,7 +102,7 @@ pub fn job(asked: &Agent, run_on: &Arc<Agent>, seed: u64) -> (Job<Seat>, mpsc::R
 fn job_with(asked: &Agent, run_on: &Arc<Agent>, seed: u64, options: &SamplerOptions) -> (Job<Seat>, mpsc::Receiver<Outcome>) {
     let episode = Arc::new(asked.open(seed, options).unwrap());
     let observation = Observation { state: vec![0.1; asked.spec().layout.state_dim], ..Observation::default() };
-    let question = Question { episode, observation };
+    let question = Question { episode, observation, haste: None };
     let act = question.begin(asked).unwrap();
     let (outcome, receiver) = mpsc::channel();
     let ticket = Seat { outcome, gate: None, patience: Patience::default(), panics: None };

@@ -304,7 +304,7 @@ async fn a_guide_leads_and_chooses() {
     assert!(told[2][0].is_some() && told[2][0] != told[3][0], "led far, and led hardly at all: {told:?}");
 }
 
-fn oracle(future: TrueFuture) -> tempfile::TempDir {
+pub fn oracle(future: TrueFuture) -> tempfile::TempDir {
     fresh(|config| {
         config.method.latent = LatentSource::Truth { dim: 2, future };
         config.units.context = Some(Affine { mean: vec![1.0, -1.0], std: vec![2.0, 0.5] });

@@ -16,6 +16,7 @@ mod late;
 mod lifecycle;
 mod limits;
 mod methods;
+mod recordings;
 mod records;
 mod steps;
 mod store;
@@ -169,7 +170,13 @@ pub async fn start_process(settings: &[&str]) -> (Process, Running) {
 /// The same with faults.
 pub async fn start_armed(faults: &[&str], settings: &[&str]) -> (Process, Running) {
     let mut command = binary(settings);
-    command.args(["--listen", "127.0.0.1:0"]).args(faults.iter().flat_map(|fault| ["--fault", fault]));
+    command.args(faults.iter().flat_map(|fault| ["--fault", fault]));
+    start_command(command).await
+}
+
+/// The same of a command that ends as `ada-server` does.
+async fn start_command(mut command: Command) -> (Process, Running) {
+    command.args(["--listen", "127.0.0.1:0"]);
     let mut process = Process(command.stderr(Stdio::piped()).spawn().unwrap());
     let mut lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
     let line = lines.by_ref().map(Result::unwrap).find(|line| line.contains("\"listening\"")).expect("it ended before it listened");

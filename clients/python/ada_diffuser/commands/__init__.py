@@ -23,9 +23,9 @@ DEFAULT_URL = "127.0.0.1:7777"
 _ENV_HELP = "short name, as point-wind-s (a wrong one lists them all), Gymnasium id, or MODULE:ID to import it from"
 
 
-def add_environment_arguments(parser: argparse.ArgumentParser) -> None:
+def add_environment_arguments(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
     """Which environment, its options, and how long its episodes are."""
-    parser.add_argument("--env", required=True, metavar="NAME", help=_ENV_HELP)
+    parser.add_argument("--env", required=required, metavar="NAME", help=_ENV_HELP)
     parser.add_argument(
         "--episode-steps", type=int, metavar="N", help="truncate episodes there (default: as the environment is registered)"
     )

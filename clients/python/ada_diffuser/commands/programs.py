@@ -39,6 +39,16 @@ class Programs:
         """In `folder`, else on the PATH, else in `target/release`. ValueError where one is nowhere."""
         return cls(*(_find(name, folder) for name in ("ada-trainer", "ada-server")))
 
+    @staticmethod
+    def exported(recording: Path, folder: Path | None) -> str:
+        """A recording of ada-server as JSON lines. ValueError where there is no such program, or it cannot read it."""
+        try:
+            server = _find("ada-server", folder)
+        except ValueError as error:
+            line = f"ada-server replay --export {recording} > {recording.with_suffix('.jsonl')}"
+            raise ValueError(f"{recording}: {error}; or replay what `{line}` writes, from wherever that program is") from None
+        return _output([server, "replay", "--export", str(recording)])
+
     def inspect(self, checkpoint: Path) -> dict[str, Any]:
         """What the trainer says of a checkpoint. ValueError where it refuses it."""
         return json.loads(_output([self.trainer, "inspect", "--json", str(checkpoint)]))

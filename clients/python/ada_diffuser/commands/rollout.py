@@ -21,6 +21,7 @@ from ada_diffuser.commands import (
     warm_start,
 )
 from ada_diffuser.commands.outputs import check_output, save_json
+from ada_diffuser.commands.programs import Programs
 from ada_diffuser.commands.progress import progress
 from ada_diffuser.options import SamplerOptions
 
@@ -34,18 +35,41 @@ Folders of --json, --plot and --film are made before the first episode, and one 
 Episode e runs with seed SEED + e, in the environment and in the model, so the same command gives the same returns and all
 models see the same episodes. Failed is what the environment's class calls failed (clients/python/README.md lists it).
 Where the server goes away under way, the run waits for it, --budget seconds at most, and a line says how long it was away. On
-a server with a store (ada-server --store) it then goes on as if nothing had been; on one without, its sessions are gone, and it ends."""
+a server with a store (ada-server --store) it then goes on as if nothing had been; on one without, its sessions are gone, and it ends.
+
+--replay FILE needs no environment: it sends what a recording of ada-server (--record DIR) holds to a running server, in sessions
+of its own, and holds every answer against the recorded one, bit for bit. It takes --url, --face, --wait, --json, --no-table and
+--programs beside it; status 1 says that an answer differs, 3 that none does and not all could be compared."""
+
+#: What goes with `--replay`.
+_OF_REPLAY = {"replay", "programs", "url", "face", "wait", "json", "table"}
+#: None differs, but not all could be compared.
+_INCOMPLETE = 3
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; 0, 1 with a line on stderr, or 130 when interrupted."""
-    arguments = _parser().parse_args(argv)
-    return run_command("ada-rollout", lambda: _run(arguments))
+    """Entry point; 0, 1 with a line on stderr, or 130 when interrupted; of `--replay` also 3."""
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if arguments.replay is None:
+        if arguments.env is None:
+            parser.error("one of --env and --replay is required")
+        return run_command("ada-rollout", lambda: _run(arguments))
+    others = [name for name, value in vars(arguments).items() if name not in _OF_REPLAY and value != parser.get_default(name)]
+    if others:
+        parser.error(f"--{others[0].replace('_', '-')} does not go with --replay")
+    status = 0
+
+    def run() -> None:
+        nonlocal status
+        status = _replay(arguments)
+
+    return run_command("ada-rollout", run) or status
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("ada-rollout", description=_ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_environment_arguments(parser)
+    add_environment_arguments(parser, required=False)
     add_server_arguments(parser)
     add_trial_arguments(parser)
     parser.add_argument("--model", default="", help="name or name@digest (default: the server's default model)")
@@ -62,7 +86,37 @@ def _parser() -> argparse.ArgumentParser:
         "--json", type=Path, metavar="FILE", help="the numbers of the table and each episode's return; with --beside a list of them"
     )
     parser.add_argument("--no-table", dest="table", action="store_false", help="print no table")
+    parser.add_argument(
+        "--replay", type=Path, metavar="FILE", help="a recording of ada-server, or what `ada-server replay --export` prints of one"
+    )
+    parser.add_argument(
+        "--programs", type=Path, metavar="DIR", help="where ada-server is, which reads recordings (default: PATH, target/release)"
+    )
     return parser
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    """The status."""
+    from ada_diffuser.recording import MAGIC, Recording, replay
+
+    check_output("--json", arguments.json)
+    with arguments.replay.open("rb") as file:
+        is_binary = file.read(len(MAGIC)) == MAGIC
+    if is_binary:
+        lines = Programs.exported(arguments.replay, arguments.programs).splitlines()
+        recording = Recording.read(lines, str(arguments.replay))
+    else:
+        recording = Recording.load(arguments.replay)
+    with Client(server_url(arguments.url, arguments.face)) as client:
+        client.wait_ready(arguments.wait)
+        # A bar would need a package that nothing else here does.
+        with progress(recording.acts, arguments.replay.name, "act", quiet=sys.stderr.isatty()) as advance:
+            done = replay(client, recording, advance)
+    if arguments.table:
+        print(done, flush=True)
+    if arguments.json:
+        save_json(done.as_json(), arguments.json)
+    return {"equal": 0, "different": 1}.get(done.verdict, _INCOMPLETE)
 
 
 def _run(arguments: argparse.Namespace) -> None:
