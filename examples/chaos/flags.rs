@@ -3,8 +3,9 @@
 use clap::{Parser, ValueEnum};
 use std::path::PathBuf;
 
-/// Kills an ada-server again and again (SIGKILL, at random times) while sessions act, reset, close and open, and holds everything that it ever
-/// answered against one undisturbed computation with the same seeds.
+/// Kills an ada-server again and again while sessions act, reset, close and open, and holds everything that it ever answered against one undisturbed
+/// computation with the same seeds. Every second time by SIGKILL at a random moment, else at a named state: an act admitted, evaluated, computed, stored,
+/// told; the drain begun.
 ///
 /// lost: an act, a reset or a session that was acknowledged and is not there. different: an answer that is not the one, or that was given twice. corrupt: a
 /// session or a store that cannot be read.

@@ -15,18 +15,13 @@ use clap::Parser;
 pub use flags::{Control, Flags};
 use indicatif::{ProgressBar, ProgressStyle};
 use life::Life;
-use process::{Place, Process};
+use process::{Death, Place, Process};
 use std::{sync::Arc, time::Duration};
 use tally::Tally;
 pub use tally::Verdicts;
-use tokio::{
-    task::JoinSet,
-    time::{sleep, timeout},
-};
+use tokio::{task::JoinSet, time::timeout};
 use tokio_util::sync::CancellationToken;
 
-/// Longest time between a server's readiness and its death. Most of it is spent in acts.
-const LIFE_MS: usize = 120;
 /// A server that is not ready by then is broken.
 const READY_MAX: Duration = Duration::from_secs(60);
 /// So long the sessions have to end what they are at, once the last server is up.
@@ -54,25 +49,28 @@ pub async fn run(flags: &Flags) -> anyhow::Result<Verdicts> {
     let agent = checkpoint::load(&flags.models.join(&flags.model)).with_context(|| format!("{}", flags.models.display()))?;
     let (agent, tally, stop) = (Arc::new(agent), Arc::new(Tally::default()), CancellationToken::new());
     let place = Place::new(flags)?;
-    let mut process = start(&place, &tally, false).await?;
+    let (mut dice, bar) = (Philox::named(flags.seed, "chaos.kills"), bar(flags));
+    let mut death = Death::draw(0, &mut dice);
+    let mut process = start(&place, &death, &tally, false).await?;
     let mut lives = JoinSet::new();
     for number in 0..flags.sessions {
         let life = Life::new((agent.clone(), flags.model.clone()), (flags, number), place.address, tally.clone());
         lives.spawn(life.live(stop.clone()));
     }
-    let (mut dice, bar) = (Philox::named(flags.seed, "chaos.kills"), bar(flags));
     for kill in 0..flags.kills {
-        sleep(Duration::from_millis(dice.below(LIFE_MS) as u64)).await;
-        process.kill().await?;
+        if process.die(&death).await? {
+            tally.died(death.word());
+        }
         place.meddle(flags.control, kill)?;
-        process = start(&place, &tally, true).await?;
+        death = Death::draw(kill + 1, &mut dice);
+        process = start(&place, &death, &tally, true).await?;
         bar.inc(1);
         bar.set_message(tally.verdicts(kill + 1).to_string().lines().last().unwrap_or_default().to_owned());
     }
     stop.cancel();
     let lives = timeout(END_MAX, lives.join_all()).await.context("the sessions came to no end")?;
     process.kill().await?;
-    let mut process = start(&place, &tally, true).await?;
+    let mut process = start(&place, &Death::Killed(Duration::ZERO), &tally, true).await?;
     let mut live = 0;
     for mut life in lives {
         life.audit().await;
@@ -85,9 +83,9 @@ pub async fn run(flags: &Flags) -> anyhow::Result<Verdicts> {
 }
 
 /// A server that is ready. One that does not start over what it finds is counted, and another one starts over what was there before.
-async fn start(place: &Place, tally: &Tally, again: bool) -> anyhow::Result<Process> {
+async fn start(place: &Place, death: &Death, tally: &Tally, again: bool) -> anyhow::Result<Process> {
     let begin = std::time::Instant::now();
-    match timeout(READY_MAX, Process::start(place)).await.context("the server did not become ready")? {
+    match timeout(READY_MAX, Process::start(place, death)).await.context("the server did not become ready")? {
         Ok(process) => {
             if again {
                 tally.ready(begin.elapsed());
@@ -97,7 +95,7 @@ async fn start(place: &Place, tally: &Tally, again: bool) -> anyhow::Result<Proc
         Err(error) => {
             tally.corrupt(&error.to_string());
             place.begin_anew()?;
-            Process::start(place).await
+            Process::start(place, death).await
         }
     }
 }

@@ -1,14 +1,17 @@
 //! One server after the other, on the same port and the same store.
 
 use super::flags::{Control, Flags};
-use ada_diffuser::serve::grpc::pb::{ListSessionsRequest, agent_client::AgentClient};
+use ada_diffuser::{
+    model::noise::Philox,
+    serve::grpc::pb::{ListSessionsRequest, agent_client::AgentClient},
+};
 use anyhow::{Context, bail};
 use std::{
     fs,
     net::{SocketAddr, TcpListener},
     path::PathBuf,
     process::{Child, Command, Stdio},
-    time::Duration,
+    time::{Duration, Instant},
 };
 use tempfile::TempDir;
 use tokio::{
@@ -22,6 +25,51 @@ use tokio::{
 const POLL: Duration = Duration::from_millis(2);
 /// Bytes that damage changes.
 const DAMAGE_LEN: usize = 64;
+
+/// How a server ends.
+#[derive(Clone, Debug)]
+pub enum Death {
+    /// By SIGKILL, after so long.
+    Killed(Duration),
+    /// By its own hand at a named state (`ada-server --fault`), the n-th time that it comes there.
+    At(&'static str, usize),
+}
+
+/// States at which a server ends. The last one is reached by SIGTERM, the others by acts.
+const STATES: [&str; 6] = ["admitted", "evaluating", "computed", "stored", "told", "draining"];
+/// A server that does not come to the named state by then is killed.
+const STATE_MAX: Duration = Duration::from_secs(2);
+/// Longest time between a server's readiness and its death. Most of it is spent in acts.
+const LIFE_MS: usize = 120;
+/// Times that a state is reached before the one that ends it.
+const NTH_MAX: usize = 60;
+
+impl Death {
+    /// Every second one at a named state, each of them in turn.
+    pub fn draw(kill: u32, dice: &mut Philox) -> Self {
+        let life = Duration::from_millis(dice.below(LIFE_MS) as u64);
+        match STATES[kill as usize / 2 % STATES.len()] {
+            _ if kill.is_multiple_of(2) => Self::Killed(life),
+            "draining" => Self::At("draining", 1),
+            state => Self::At(state, 1 + dice.below(NTH_MAX)),
+        }
+    }
+
+    /// The word in the sum.
+    pub fn word(&self) -> &'static str {
+        match self {
+            Self::Killed(_) => "killed",
+            Self::At(state, _) => state,
+        }
+    }
+
+    fn flags(&self) -> Vec<String> {
+        match self {
+            Self::Killed(_) => Vec::new(),
+            Self::At(state, nth) => vec!["--fault".to_owned(), format!("{state}=kill@{nth}")],
+        }
+    }
+}
 
 /// Where servers run.
 pub struct Place {
@@ -124,8 +172,9 @@ impl Process {
     ///
     /// # Errors
     /// If it ends before it is ready, with what it said.
-    pub async fn start(place: &Place) -> anyhow::Result<Self> {
+    pub async fn start(place: &Place, death: &Death) -> anyhow::Result<Self> {
         let mut command = place.command();
+        command.args(death.flags());
         let child = command.spawn().with_context(|| format!("{}", place.flags.server.display()))?;
         let mut process = Self { child, address: place.address };
         while !process.is_ready().await {
@@ -155,6 +204,32 @@ impl Process {
             let _unread = std::io::Read::read_to_string(stderr, &mut said);
         }
         said
+    }
+
+    /// Waits for its death; says whether that came as it was meant to.
+    ///
+    /// # Errors
+    /// If the system refuses.
+    pub async fn die(mut self, death: &Death) -> anyhow::Result<bool> {
+        match death {
+            Death::Killed(life) => sleep(*life).await,
+            Death::At(state, _) => {
+                if *state == "draining" {
+                    sleep(Duration::from_millis(LIFE_MS as u64 / 2)).await;
+                    Command::new("kill").args(["-TERM", &self.child.id().to_string()]).status()?;
+                }
+                let end = Instant::now() + STATE_MAX;
+                while Instant::now() < end {
+                    if let Some(status) = self.child.try_wait()? {
+                        return Ok(status.code().is_none());
+                    }
+                    sleep(POLL).await;
+                }
+            }
+        }
+        let by_hand = matches!(death, Death::Killed(_));
+        self.kill().await?;
+        Ok(by_hand)
     }
 
     /// SIGKILL.

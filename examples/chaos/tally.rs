@@ -2,7 +2,7 @@
 
 use parking_lot::Mutex;
 use serde::Serialize;
-use std::{fmt, time::Duration};
+use std::{collections::BTreeMap, fmt, time::Duration};
 
 /// Complaints that are told in full.
 const TOLD_MAX: usize = 8;
@@ -23,6 +23,7 @@ struct Counts {
     different: u64,
     corrupt: u64,
     ready: Vec<Duration>,
+    deaths: BTreeMap<&'static str, u64>,
     told: Vec<String>,
 }
 
@@ -87,6 +88,11 @@ impl Tally {
         self.fault(Fault::Corrupt(said.to_owned()));
     }
 
+    /// A server ended so.
+    pub fn died(&self, how: &'static str) {
+        *self.0.lock().deaths.entry(how).or_default() += 1;
+    }
+
     /// A server was ready after so long.
     pub fn ready(&self, after: Duration) {
         self.0.lock().ready.push(after);
@@ -123,6 +129,7 @@ impl Tally {
             retried: counts.retried,
             ready_ms_p50: quantile(0.5),
             ready_ms_max: quantile(1.0),
+            deaths: counts.deaths.clone(),
             told: counts.told.clone(),
         }
     }
@@ -155,6 +162,8 @@ pub struct Verdicts {
     pub ready_ms_p50: f64,
     /// The longest.
     pub ready_ms_max: f64,
+    /// How they ended: by SIGKILL, or by their own hand at a named state.
+    pub deaths: BTreeMap<&'static str, u64>,
     /// The first complaints.
     pub told: Vec<String>,
 }
@@ -168,8 +177,22 @@ impl Verdicts {
 
 impl fmt::Display for Verdicts {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { kills, lost, different, corrupt, acts, replayed, resets, opened, closed, retried, ready_ms_p50, ready_ms_max, told } =
-            self;
+        let Self {
+            kills,
+            lost,
+            different,
+            corrupt,
+            acts,
+            replayed,
+            resets,
+            opened,
+            closed,
+            retried,
+            ready_ms_p50,
+            ready_ms_max,
+            deaths,
+            told,
+        } = self;
         for what in told {
             writeln!(f, "{what}")?;
         }
@@ -177,6 +200,8 @@ impl fmt::Display for Verdicts {
             f,
             "{acts} acts, {replayed} of them asked once more, {resets} resets, {opened} sessions opened, {closed} closed; {retried} calls made again"
         )?;
+        let deaths: Vec<_> = deaths.iter().map(|(how, count)| format!("{count} {how}")).collect();
+        writeln!(f, "deaths: {}", deaths.join(", "))?;
         writeln!(f, "ready after {ready_ms_p50:.0} ms (median), {ready_ms_max:.0} ms at most")?;
         writeln!(f, "kills={kills} lost={lost} different={different} corrupt={corrupt}")
     }

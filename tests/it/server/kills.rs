@@ -18,6 +18,7 @@ async fn no_act_is_lost_and_none_given_twice() {
     for durability in ["process", "power"] {
         let verdicts = kill(&format!("--kills 12 --durability {durability}")).await;
         assert_eq!(verdicts.found(), 0, "{durability}: {verdicts}");
+        assert!(verdicts.deaths.len() > 5 && verdicts.deaths.values().sum::<u64>() > 9, "each in its way: {verdicts}");
         assert!(verdicts.acts > 200 && verdicts.replayed > 20 && verdicts.resets > 0 && verdicts.closed > 0, "{durability}: {verdicts}");
     }
 }

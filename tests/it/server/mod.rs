@@ -157,8 +157,8 @@ pub struct Process(pub Child);
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // It may have ended already.
-        let _ended = self.0.kill();
+        // It may have ended already. Whoever starts another one over the same files needs this one gone.
+        let _ended = self.0.kill().and_then(|()| self.0.wait());
     }
 }
 

@@ -160,7 +160,10 @@ async fn many_more_than_memory_holds_come_at_once() {
         });
     }
     clients.join_all().await;
-    assert!(server.metric("ada_sessions").await <= 150.0 && server.metric("ada_store_sessions").await >= 700.0);
+    assert!(server.metric("ada_sessions").await <= 150.0);
+    // The store is asked how much it holds now and then.
+    let counted = async { while server.metric("ada_store_sessions").await < 768.0 {} };
+    timeout(Duration::from_secs(10), counted).await.expect("all of them are kept");
 }
 
 /// Time to live goes on behind memory; a restart gives everyone the whole of it again, and an ending is remembered.
