@@ -38,11 +38,11 @@ Where the server goes away under way, the run waits for it, --budget seconds at 
 a server with a store (ada-server --store) it then goes on as if nothing had been; on one without, its sessions are gone, and it ends.
 
 --replay FILE needs no environment: it sends what a recording of ada-server (--record DIR) holds to a running server, in sessions
-of its own, and holds every answer against the recorded one, bit for bit. It takes --url, --face, --wait, --json, --no-table and
---programs beside it; status 1 says that an answer differs, 3 that none does and not all could be compared."""
+of its own, and holds every answer against the recorded one, bit for bit. It takes --url, --face, --wait, --budget, --json, --no-table
+and --programs beside it; status 1 says that an answer differs, 3 that none does and not all could be compared."""
 
 #: What goes with `--replay`.
-_OF_REPLAY = {"replay", "programs", "url", "face", "wait", "json", "table"}
+_OF_REPLAY = {"replay", "programs", "url", "face", "wait", "budget", "json", "table"}
 #: None differs, but not all could be compared.
 _INCOMPLETE = 3
 
@@ -107,7 +107,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         recording = Recording.read(lines, str(arguments.replay))
     else:
         recording = Recording.load(arguments.replay)
-    with Client(server_url(arguments.url, arguments.face)) as client:
+    with client_of(arguments) as client:
         client.wait_ready(arguments.wait)
         # A bar would need a package that nothing else here does.
         with progress(recording.acts, arguments.replay.name, "act", quiet=sys.stderr.isatty()) as advance:
