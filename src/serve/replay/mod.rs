@@ -1,6 +1,6 @@
 //! Recordings, replayed: every act is computed again by the engine, on its session's own state, and has to give the same bits.
 //!
-//! A [`Player`] reads a file and hands acts to an engine of as many workers and rows as are asked for; acts of one session go one after the other, those of
+//! A `Player` reads a file and hands acts to an engine of as many workers and rows as are asked for; acts of one session go one after the other, those of
 //! many share batches. What a deadline made of an act is made of it again ([`crate::model::agent::Haste`]). After a difference a session has gone another
 //! way, and what follows of it is not held against what was recorded.
 
