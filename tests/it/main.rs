@@ -6,5 +6,6 @@
 mod allocations;
 mod golden;
 mod laws;
+mod protocol;
 mod server;
 mod trainer;
