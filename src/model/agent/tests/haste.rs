@@ -15,12 +15,14 @@ fn a_hurried_act_is_done_again() {
     for seed in 0..400 {
         let mut stream = Philox::new(1000 + seed);
         let mut draw = |below: u64| (stream.normal().abs() * 1e4) as u64 % below;
+        let streaming = draw(3) > 0;
         let options = SamplerOptions {
+            streaming,
+            // A window that is kept is one alone.
+            candidates: if streaming { 1 } else { 1 + draw(3) as usize },
             action_horizon: 1 + draw(3) as usize,
             sub_steps: 1 + draw(4) as usize,
             picard_window: 1 + draw(2) as usize * 2,
-            candidates: 1 + draw(3) as usize,
-            streaming: draw(3) > 0,
             eta: 0.7,
             latent: LatentMode::Sample,
             ..options()
