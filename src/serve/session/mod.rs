@@ -6,6 +6,8 @@ mod keeping;
 mod key;
 mod poison;
 mod record;
+mod reset;
+mod summary;
 mod table;
 mod taping;
 mod untold;
@@ -15,6 +17,8 @@ pub use handle::Handle;
 pub use keeping::name_of;
 pub use key::{Key, key_of};
 pub use record::{Kept, Last, Record, Unreadable};
+pub use reset::{Renewal, Reset};
+pub use summary::{Detail, Summary};
 pub use table::Sessions;
 pub use taping::Taken;
 pub use untold::Untold;
@@ -27,8 +31,8 @@ use crate::{
     serve::{
         engine::Patience,
         error::ServiceError,
-        recording::{Mark, Recorder},
-        store::{UnixMs, Version, unix_ms},
+        recording::Mark,
+        store::{UnixMs, unix_ms},
     },
 };
 use parking_lot::Mutex;
@@ -119,23 +123,6 @@ pub struct Standing {
     pub last: Option<Last>,
 }
 
-/// What a new episode is made with.
-#[derive(Clone, Copy, Debug)]
-pub struct Renewal {
-    /// Its seed.
-    pub seed: u64,
-    /// Whether the latent goes on looking back on the one before.
-    pub keep_history: bool,
-}
-
-/// A new episode that is about to begin.
-pub struct Reset {
-    from: Version,
-    renewal: Renewal,
-    episode: Arc<Episode>,
-    standing: Standing,
-}
-
 /// One session. Its slot is locked for moments only, never while a model runs or across an await.
 pub struct Session {
     /// Random, 122 bits: knowing it is the right to use it.
@@ -191,46 +178,6 @@ pub enum Entry {
     Join(Waiter),
     /// It is the next one: compute it from this episode.
     Lead(Waiter, Arc<Episode>),
-}
-
-/// A session in numbers.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Summary {
-    /// Its id, for those who know it: no list tells it.
-    pub id: Option<Uuid>,
-    /// Its name in lists.
-    pub handle: Handle,
-    /// Name of the model.
-    pub model: Arc<str>,
-    /// Acts committed in the running episode.
-    pub committed_step: u64,
-    /// How often it was reset.
-    pub episode: u64,
-    /// What a short list leaves out.
-    pub detail: Option<Detail>,
-    /// Since it was opened.
-    pub age: Duration,
-    /// Since it was touched.
-    pub idle: Duration,
-    /// When idle for so long it expires.
-    pub ttl: Duration,
-    /// Memory of its episode.
-    pub state_bytes: usize,
-    /// Whether an act is in flight.
-    pub busy: bool,
-}
-
-/// What takes room in a summary.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Detail {
-    /// Digest of the model.
-    pub model_digest: String,
-    /// Seed of the running episode.
-    pub seed: u64,
-    /// Options in force.
-    pub options: SamplerOptions,
-    /// Latent mean and log-variance after the last act.
-    pub latent: Option<(Vec<f32>, Vec<f32>)>,
 }
 
 impl Session {
@@ -344,61 +291,6 @@ impl Session {
         flight.settle(Err(error));
     }
 
-    /// Begins a new episode, made from the old one, which is this one if one is named; until it is finished nothing else happens to the session. None: a named
-    /// request that has reset the session already does not do so again: a copy that came late once undid 24 committed acts.
-    ///
-    /// # Errors
-    /// If the episode is over, while an act is in flight, or after the end; and those of [`Agent::reset`].
-    pub fn begin_reset(
-        &self,
-        renewal: Renewal,
-        ends: Option<u64>,
-        request_id: String,
-        now: Instant,
-    ) -> Result<Option<Reset>, ServiceError> {
-        let mut slot = self.slot.lock();
-        if slot.ended {
-            return Err(ServiceError::SessionNotFound);
-        }
-        if slot.reset_ids.contains(&request_id) {
-            slot.touched = now;
-            return Ok(None);
-        }
-        slot.check_episode(ends)?;
-        if slot.resetting || slot.flight.as_ref().is_some_and(|flight| flight.is_busy()) {
-            return Err(ServiceError::SessionBusy { committed: slot.committed.step });
-        }
-        let Renewal { seed, keep_history } = renewal;
-        let episode = self.agent.reset(&slot.committed.episode, seed, keep_history).map_err(ServiceError::from_agent)?;
-        let from = self.version(&slot);
-        slot.resetting = true;
-        slot.flight = None;
-        let mut reset_ids = slot.reset_ids.clone();
-        remember(&mut reset_ids, request_id);
-        Ok(Some(Reset {
-            from,
-            renewal,
-            episode: Arc::new(episode),
-            standing: Standing { resets: slot.resets + 1, reset_ids: reset_ids.into(), ..Standing::default() },
-        }))
-    }
-
-    /// Finishes it, and takes down what is recorded of it; None: it could not be kept, and the session stands where it stood.
-    pub fn finish_reset(&self, reset: Option<Reset>, recorder: Option<&Recorder>) {
-        let mut slot = self.slot.lock();
-        slot.resetting = false;
-        slot.touched = Instant::now();
-        let Some(Reset { from: _, renewal, episode, standing }) = reset.filter(|_| !slot.ended) else { return };
-        self.swap_bytes(slot.committed.episode.size_bytes(), episode.size_bytes());
-        (slot.resets, slot.reset_ids) = (standing.resets, standing.reset_ids.into());
-        let committed = Committed { step: standing.step, episode, last: None };
-        let before = std::mem::replace(&mut slot.committed, committed);
-        slot.poisons.clear();
-        if let Some(recorder) = recorder {
-            self.take_down_reset(&mut slot, &before, renewal, recorder);
-        }
-    }
-
     /// Idle time to live.
     pub fn ttl(&self) -> Duration {
         self.ttl
@@ -421,36 +313,6 @@ impl Session {
         let reset_ids = slot.reset_ids.iter().cloned().collect();
         let last = slot.committed.last.as_ref().map(|(key, answer)| Last::of(*key, answer));
         Ok((slot.committed.episode.clone(), Standing { step: committed, resets: slot.resets, reset_ids, last }))
-    }
-
-    /// The session in numbers, for whoever knows its id.
-    pub fn summary(&self, now: Instant) -> Summary {
-        Summary { id: Some(self.id), ..self.listed(true, now) }
-    }
-
-    /// The session in numbers, for everyone.
-    pub fn listed(&self, in_full: bool, now: Instant) -> Summary {
-        let slot = self.slot.lock();
-        let episode = &slot.committed.episode;
-        let detail = || Detail {
-            model_digest: self.agent.spec().digest.clone(),
-            seed: episode.seed(),
-            options: self.options.clone(),
-            latent: episode.latent().map(|(mean, log_var)| (mean.to_vec(), log_var.to_vec())),
-        };
-        Summary {
-            id: None,
-            handle: self.handle,
-            model: self.model.clone(),
-            committed_step: slot.committed.step,
-            episode: slot.resets,
-            detail: in_full.then(detail),
-            age: Duration::from_millis(unix_ms().saturating_sub(self.opened)),
-            idle: now.saturating_duration_since(slot.touched),
-            ttl: self.ttl,
-            state_bytes: episode.size_bytes(),
-            busy: slot.flight.as_ref().is_some_and(|flight| flight.is_busy()),
-        }
     }
 
     /// Notes that somebody asks for it; says whether nobody had before.
@@ -529,14 +391,4 @@ impl Slot {
         }
         held && !self.ended
     }
-}
-
-fn remember(reset_ids: &mut VecDeque<String>, reset_id: String) {
-    if reset_id.is_empty() {
-        return;
-    }
-    if reset_ids.len() >= RESET_IDS_MAX {
-        reset_ids.pop_front();
-    }
-    reset_ids.push_back(reset_id);
 }
