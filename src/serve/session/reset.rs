@@ -29,7 +29,7 @@ impl Session {
     /// request that has reset the session already does not do so again: a copy that came late once undid 24 committed acts.
     ///
     /// # Errors
-    /// If the episode is over, while an act is in flight, or after the end; and those of [`Agent::reset`].
+    /// If the episode is over, while an act is in flight, or after the end; and those of [`crate::model::agent::Agent::reset`].
     pub fn begin_reset(
         &self,
         renewal: Renewal,
