@@ -64,7 +64,7 @@ def _cost(folder: Path) -> Iterator[Row]:
             for which in (0, 1) if turn % 2 else (1, 0):
                 for at, (_, clients, settings) in enumerate(COSTS):
                     words = ("--clients", clients, "--seconds", SECONDS, "--warm-up", 0.3, *settings)
-                    turns.setdefault((which, at), []).append(report(load((plain, recording)[which], *words)))
+                    turns.setdefault((which, at), []).append(_turn((plain, recording)[which], words))
         written = recording.metric("ada_record_bytes_total") / recording.metric("ada_record_entries_total")
         left_out = recording.metric("ada_record_dropped_total")
         entries = recording.metric("ada_record_entries_total")
@@ -73,9 +73,19 @@ def _cost(folder: Path) -> Iterator[Row]:
         pairs = list(zip(turns[0, at], turns[1, at], strict=True))
         ratio = statistics.median(with_["acts_per_s"] / without["acts_per_s"] for without, with_ in pairs)
         beyond = statistics.median(with_["latency_ms"]["p50"] - without["latency_ms"]["p50"] for without, with_ in pairs)
+        processor = statistics.median(with_["processor_us"] / without["processor_us"] for without, with_ in pairs)
         acts = statistics.median(without["acts_per_s"] for without, _ in pairs)
         yield Row("recording", f"{kind}, {clients} clients: acts a second without", acts, 0, "1/s", at_least=True)
         yield Row("recording", f"{kind}, {clients} clients: acts a second to without", ratio, 0.9, "", at_least=True)
         yield Row("recording", f"{kind}, {clients} clients: p50 beyond without", beyond, 0.3, "ms")
+        yield Row("recording", f"{kind}, {clients} clients: processor time of an act to without", processor, 1.1, "")
     yield Row("recording", "bytes of an act", written, 4096, "B")
     yield Row("recording", f"left out of {left_out + entries:.0f} under full load", left_out, 0, "acts")
+
+
+def _turn(server: Server, words: tuple[object, ...]) -> dict[str, Any]:
+    """What the generator says, and what an act took of the server's processor time, which does not depend on what else runs."""
+    processor, acts = server.processor_s(), server.metric("ada_acts_total")
+    told = report(load(server, *words))
+    took = server.processor_s() - processor
+    return {**told, "processor_us": 1e6 * took / (server.metric("ada_acts_total") - acts)}
