@@ -152,7 +152,7 @@ pub struct StoreConfig {
     pub durability: Durability,
     /// Sessions that are kept, those in memory among them; one more is refused (STORE_FULL).
     pub len_max: u64,
-    /// Bytes of its file. At a third of it, in records, no session more is opened (STORE_FULL), and those that are there go on.
+    /// Bytes of its file. At a fifth of it, in records, no session more is opened (STORE_FULL), and those that are there go on.
     pub bytes_max: u64,
     /// Memory for its pages.
     pub cache_bytes: usize,
@@ -296,7 +296,7 @@ impl Default for StoreConfig {
             dir: PathBuf::new(),
             durability: Durability::Process,
             len_max: 1_000_000,
-            bytes_max: 16 << 30,
+            bytes_max: 64 << 30,
             cache_bytes: 64 << 20,
             queue_len_max: 4096,
             sweep_len: 2_000,

@@ -48,9 +48,9 @@ const PROBES: TableDefinition<u64, &[u8]> = TableDefinition::new("probes");
 const PROBE_LEN: usize = 4 << 20;
 /// After a failure it is not tried again for so long: opening a file that fails takes its time, and many may ask.
 const REST: Duration = Duration::from_millis(200);
-/// Bytes of the file for one of a record, with room for copies on write: pages come in powers of two, and are half empty now and then. Measured: see
-/// docs/reliability.md.
-const SPREAD: u64 = 3;
+/// Bytes of the file for one of a record, at worst: the file grows by doubling, so that half of its bound may be out of reach; pages come in powers of two,
+/// and may be half empty; and there is room for copies on write.
+const SPREAD: u64 = 5;
 
 /// Of an embedded home.
 #[derive(Clone, Copy, Debug)]
