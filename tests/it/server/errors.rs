@@ -443,7 +443,7 @@ async fn a_deadline_gets_a_degraded_answer() {
     assert!(grpc.degraded);
     // One who joins and has time decides for all who wait.
     let id = server.open(json!({"model": "slow"})).await;
-    let (mut agent, request) = (server.agent().await, pb::ActRequest { deadline_ms: Some(1_500), ..act(&id, 1, &STATE) });
+    let (mut agent, request) = (server.agent().await, pb::ActRequest { deadline_ms: Some(5_000), ..act(&id, 1, &STATE) });
     let hasty = tokio::spawn(async move { agent.act(request).await });
     server.until(&id, |session| session["busy"] == true).await;
     let patient = server.start_slow(&id).await;

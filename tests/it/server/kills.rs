@@ -8,7 +8,7 @@ use clap::Parser;
 mod chaos;
 
 async fn kill(words: &str) -> Verdicts {
-    let fixed = format!("chaos --quiet --sessions 16 --server {} {words}", env!("CARGO_BIN_EXE_ada-server"));
+    let fixed = format!("chaos --quiet --sessions 8 --server {} {words}", env!("CARGO_BIN_EXE_ada-server"));
     chaos::run(&Flags::parse_from(fixed.split_whitespace())).await.unwrap()
 }
 
@@ -19,7 +19,7 @@ async fn no_act_is_lost_and_none_given_twice() {
         let verdicts = kill(&format!("--kills 12 --durability {durability}")).await;
         assert_eq!(verdicts.found(), 0, "{durability}: {verdicts}");
         assert!(verdicts.deaths.len() > 5 && verdicts.deaths.values().sum::<u64>() > 9, "each in its way: {verdicts}");
-        assert!(verdicts.acts > 200 && verdicts.replayed > 20 && verdicts.resets > 0 && verdicts.closed > 0, "{durability}: {verdicts}");
+        assert!(verdicts.acts > 100 && verdicts.replayed > 10 && verdicts.resets > 0 && verdicts.closed > 0, "{durability}: {verdicts}");
     }
 }
 
