@@ -62,7 +62,8 @@ pub async fn run(flags: &Flags) -> anyhow::Result<Verdicts> {
             tally.died(death.word());
         }
         place.meddle(flags.control, kill)?;
-        death = Death::draw(kill + 1, &mut dice);
+        // The last one has to live until all have come to an end.
+        death = if kill + 1 < flags.kills { Death::draw(kill + 1, &mut dice) } else { Death::Killed(Duration::ZERO) };
         process = start(&place, &death, &tally, true).await?;
         bar.inc(1);
         bar.set_message(tally.verdicts(kill + 1).to_string().lines().last().unwrap_or_default().to_owned());

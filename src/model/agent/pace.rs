@@ -4,7 +4,7 @@
 use super::Haste;
 
 /// Changes of mind that are noted. The act keeps to the last one noted where the clock would change it more often: memory for them is taken when
-/// the act begins, and what was not noted could not be done again.
+/// the act begins, and what was not noted could not be done again. The last place is kept for the end of all hurry: somebody with time may join late.
 const BOUNDS_MAX: usize = 32;
 
 /// See the module.
@@ -33,7 +33,7 @@ impl Pace {
     pub(super) fn settle(&mut self, forward: u32, bound: Option<u32>) -> Option<u32> {
         let bound = match &self.script {
             Some(script) => script.bounds.iter().find(|(at, _)| *at == forward).map_or(self.standing, |(_, left)| *left),
-            None if self.haste.bounds.len() == BOUNDS_MAX => self.standing,
+            None if self.haste.bounds.len() + usize::from(bound.is_some()) >= BOUNDS_MAX => self.standing,
             None => bound,
         };
         if bound != self.standing {
@@ -76,10 +76,11 @@ mod tests {
         assert_eq!(pace.haste.bounds, [(4, Some(3))]);
         let mut fickle = Pace::new();
         let followed = (0..100).filter(|forward| fickle.settle(*forward, Some(50 + forward % 2 * 7)) == Some(50 + forward % 2 * 7)).count();
-        assert!(fickle.haste.bounds.len() == BOUNDS_MAX && followed < 40, "{followed}");
+        assert!(fickle.haste.bounds.len() == BOUNDS_MAX - 1 && followed < 40, "{followed}");
+        assert_eq!([None, Some(3)].map(|bound| fickle.settle(100, bound)), [None, None], "one who has time joins, and decides");
         let (mut again, script) = (Pace::new(), fickle.haste.clone());
         again.repeat(script);
-        assert!((0..100).filter_map(|forward| again.settle(forward, None)).all(|left| left <= 57));
+        assert!((0..=100).filter_map(|forward| again.settle(forward, None)).all(|left| left <= 57));
         assert_eq!(again.take_haste(), fickle.haste);
     }
 }
