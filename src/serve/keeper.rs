@@ -6,11 +6,8 @@ use crate::serve::{
     error::ServiceError,
     recording::Recorder,
     registry::Registry,
-    session::{Handle, Kept, Opening, Renewal, Session, Sessions, Summary, name_of},
-    store::{
-        Change, Durability, Embedded, Ending, Options, Outcome, Place, Refused, Store, StoreError, UnixMs, VERSION_LEN, Version, Write,
-        unix_ms,
-    },
+    session::{Handle, Kept, Opening, Renewal, Session, Sessions, Summary, Untold, name_of},
+    store::{Change, Durability, Embedded, Ending, Head, Options, Outcome, Place, Refused, Store, StoreError, UnixMs, Write, unix_ms},
 };
 use parking_lot::Mutex;
 use std::{
@@ -46,8 +43,8 @@ pub struct Keeper {
     store: Option<Arc<Store>>,
     config: StoreConfig,
     tombstone_ttl: Duration,
-    /// No session expires for what went by before: the clock may have jumped, and its client could not reach it.
-    started: UnixMs,
+    /// See [`Head::has_expired`].
+    began: UnixMs,
     /// Where acts and resets are recorded, if they are.
     recorder: Option<Arc<Recorder>>,
     /// Where the search for expired sessions stands.
@@ -67,7 +64,7 @@ impl Keeper {
             store,
             config: config.clone(),
             tombstone_ttl: Duration::from_millis(sessions.tombstone_ttl_ms),
-            started: unix_ms(),
+            began: unix_ms(),
             recorder: None,
             swept: Mutex::default(),
         })
@@ -120,8 +117,7 @@ impl Keeper {
 
     fn revive(&self, handle: Handle, bytes: &[u8], registry: &Registry) -> Result<Arc<Session>, ServiceError> {
         let kept = read(bytes)?;
-        if self.has_expired(&kept) {
-            self.expire(handle, bytes, &kept);
+        if self.expire(handle, bytes, &kept) {
             return Err(ServiceError::SessionExpired);
         }
         let Kept { id, request_id, opened, touched: _, record } = kept;
@@ -133,13 +129,14 @@ impl Keeper {
         self.table.revive(opening, Instant::now())
     }
 
-    /// Opens a session; or gives that which a request of this name has opened, before a restart too.
+    /// Opens a session, and what ends it if its client is never told, as one that named its request need not be; or gives that which a request of this
+    /// name has opened, before a restart too.
     ///
     /// # Errors
     /// Those of [`Sessions::open`]; `StoreFull`, `StoreUnavailable`.
-    pub async fn open(&self, opening: Opening, registry: &Registry) -> Result<Arc<Session>, ServiceError> {
-        let Some(store) = self.store.clone() else { return self.table.open(opening, Instant::now()) };
-        if let Some(name) = name_of(&opening.request_id) {
+    pub async fn open(&self, opening: Opening, registry: &Registry) -> Result<(Arc<Session>, Option<Arc<Untold>>), ServiceError> {
+        let name = name_of(&opening.request_id);
+        if let (Some(name), Some(store)) = (name, &self.store) {
             let home = store.home().clone();
             let named = spawn_blocking(move || home.named(name)).await.map_err(|error| ServiceError::internal(&error))?;
             if let Some(handle) = named.map_err(|error| ServiceError::from_store(&error))? {
@@ -148,10 +145,15 @@ impl Keeper {
             }
         }
         let session = self.table.open(opening, Instant::now())?;
+        // Before it is waited for: whoever asks may be gone by then.
+        let untold = name.is_none().then(|| Untold::new(self.table.clone(), session.clone()));
+        if self.store.is_none() {
+            return Ok((session, untold));
+        }
         let kept = self.keep(session.opened()?, |_| ()).await;
         let error = match kept {
             // Another request of its name has kept it.
-            Ok(Ok(()) | Err(Refused::Conflict)) => return Ok(session),
+            Ok(Ok(()) | Err(Refused::Conflict)) => return Ok((session, untold)),
             Ok(Err(Refused::Full)) => ServiceError::StoreFull,
             Err(error) => ServiceError::from_store(&error),
         };
@@ -281,38 +283,39 @@ impl Keeper {
         if let Some(live) = self.table.live(handle) {
             return Some(live.listed(in_full, now));
         }
-        let kept = read(bytes).ok().filter(|kept| !self.has_expired(kept))?;
-        Some(kept.summary(handle, in_full))
+        let kept = read(bytes).ok()?;
+        (!Head::of(bytes)?.has_expired(self.began, unix_ms())).then(|| kept.summary(handle, in_full))
     }
 
-    fn has_expired(&self, kept: &Kept) -> bool {
-        unix_ms() >= kept.touched.max(self.started).saturating_add(kept.record.ttl_ms)
-    }
-
-    /// Ends one in the store, unless it has gone on meanwhile.
-    fn expire(&self, handle: Handle, bytes: &[u8], kept: &Kept) {
-        let Some(store) = &self.store else { return };
-        let ending = Some((Ending::Expired, unix_ms()));
-        let change = Change::Free { from: Version::of(bytes), ending, name: name_of(&kept.request_id) };
+    /// Ends one in the store if it has expired, unless it goes on meanwhile; says whether it has.
+    fn expire(&self, handle: Handle, bytes: &[u8], kept: &Kept) -> bool {
+        let (Some(store), Some(head), now) = (&self.store, Head::of(bytes), unix_ms()) else { return false };
+        if !head.has_expired(self.began, now) {
+            return false;
+        }
+        let change = Change::Free { from: Some(head.version), ending: Some((Ending::Expired, now)), name: name_of(&kept.request_id) };
         store.submit(Write { handle, change }, |freed| {
             if let Ok(Ok(())) = freed {
                 metrics::counter!("ada_sessions_ended_total", "reason" => Ending::Expired.word()).increment(1);
             }
         });
+        true
     }
 
-    /// Ends what has expired, in memory and, a few at a time, in the store. Blocks for moments.
+    /// Ends what has expired, in memory and, a few at a time, in the store. Blocks, for as long as a failing disk likes.
     pub fn reap(&self) {
         self.table.reap(Instant::now());
         let Some(store) = &self.store else { return };
         store.upkeep();
         let mut swept = self.swept.lock();
-        let Ok(page) = store.home().page(*swept, self.config.sweep_len) else { return };
-        *swept = page.last().filter(|_| page.len() == self.config.sweep_len).map(|(handle, _)| *handle);
-        for (handle, bytes) in page {
+        let Ok(heads) = store.home().heads(*swept, self.config.sweep_len) else { return };
+        *swept = heads.last().filter(|_| heads.len() == self.config.sweep_len).map(|(handle, _)| *handle);
+        let now = unix_ms();
+        for (handle, _) in heads.into_iter().filter(|(_, head)| head.has_expired(self.began, now)) {
+            // A head has no checksum: what ends is what is whole.
             if self.table.live(handle).is_none()
+                && let Ok(Place::Kept(bytes)) = store.home().read(handle)
                 && let Ok(kept) = read(&bytes)
-                && self.has_expired(&kept)
             {
                 self.expire(handle, &bytes, &kept);
             }
@@ -333,7 +336,7 @@ fn start(config: &StoreConfig) -> Result<Store, KeeperError> {
 }
 
 fn read(bytes: &[u8]) -> Result<Kept, ServiceError> {
-    Kept::read(bytes.get(VERSION_LEN..).unwrap_or_default()).map_err(|error| ServiceError::corrupt(&error))
+    Kept::read(bytes).map_err(|error| ServiceError::corrupt(&error))
 }
 
 #[cfg(test)]

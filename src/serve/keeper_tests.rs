@@ -11,6 +11,8 @@ use crate::{
 };
 use std::path::{Path, PathBuf};
 
+const LONG: Duration = Duration::from_secs(60);
+
 fn seen() -> Observation {
     Observation { state: vec![0.1; 4], ..Observation::default() }
 }
@@ -30,7 +32,7 @@ fn keeper(dir: PathBuf) -> Keeper {
     Keeper::open_store(&SessionsConfig::default(), &StoreConfig { dir, ..StoreConfig::default() }).unwrap()
 }
 
-fn opening(registry: &Registry) -> Opening {
+fn opening(registry: &Registry, ttl: Duration) -> Opening {
     let model = registry.get("").unwrap();
     let episode = model.agent.open(1, &model.agent.spec().sampler).unwrap();
     Opening {
@@ -38,7 +40,7 @@ fn opening(registry: &Registry) -> Opening {
         agent: model.agent.clone(),
         episode: Arc::new(episode),
         standing: Standing::default(),
-        ttl: Duration::from_secs(60),
+        ttl,
         request_id: String::new(),
         known: None,
     }
@@ -70,7 +72,7 @@ async fn memory_that_is_behind_is_found_out() {
     let (_models, registry) = models();
     let dir = tempfile::tempdir().unwrap();
     let keeper = keeper(dir.path().to_owned());
-    let session = keeper.open(opening(&registry), &registry).await.unwrap();
+    let (session, _untold) = keeper.open(opening(&registry, LONG), &registry).await.unwrap();
     let kept = next(&session);
     assert_eq!(keeper.keep(kept.clone(), |_| ()).await, Ok(Ok(())), "nobody told the session");
     assert_eq!(keeper.keep(next(&session), |_| ()).await, Ok(Err(Refused::Conflict)));
@@ -93,12 +95,52 @@ async fn what_went_on_does_not_expire() {
     let (_models, registry) = models();
     let dir = tempfile::tempdir().unwrap();
     let keeper = keeper(dir.path().to_owned());
-    let session = keeper.open(opening(&registry), &registry).await.unwrap();
+    let (session, _untold) = keeper.open(opening(&registry, Duration::from_millis(1)), &registry).await.unwrap();
     let home = keeper.store().unwrap().home().clone();
     let (handle, bytes) = home.page(None, 1).unwrap().remove(0);
     let kept = read(&bytes).unwrap();
     assert_eq!(keeper.keep(next(&session), |_| ()).await, Ok(Ok(())));
-    keeper.expire(handle, &bytes, &kept);
+    tokio::time::sleep(Duration::from_millis(20)).await;
+    assert!(keeper.expire(handle, &bytes, &kept), "as it was read");
     keeper.stop();
     assert!(matches!(home.read(handle), Ok(Place::Kept(_))));
+}
+
+/// One whose caller has gone while its open was on its way into the store is undone, there too; one that has a name stays.
+#[tokio::test]
+async fn an_open_that_is_given_up_is_undone() {
+    let (_models, registry) = models();
+    let dir = tempfile::tempdir().unwrap();
+    let keeper = keeper(dir.path().to_owned());
+    let home = keeper.store().unwrap().home().clone();
+    for (request_id, left) in [("", 0), ("mine", 1)] {
+        let asked = Opening { request_id: request_id.to_owned(), ..opening(&registry, LONG) };
+        let mut open = Box::pin(keeper.open(asked, &registry));
+        // Until it is on its way; one that has a name is looked for first.
+        while futures_util::poll!(&mut open).is_pending() && keeper.table().is_empty() {
+            tokio::task::yield_now().await;
+        }
+        drop(open);
+        let (told, written) = oneshot::channel();
+        let last = Write { handle: Handle::of(Uuid::nil()), change: Change::Free { from: None, ending: None, name: None } };
+        keeper.store().unwrap().submit(last, |_| told.send(()).unwrap());
+        written.await.unwrap();
+        assert_eq!((keeper.table().len(), home.size().unwrap().sessions), (left, left as u64), "{request_id:?}");
+    }
+}
+
+/// What stands before a record is held against it: a changed one would pass for another commit, or end the session early.
+#[tokio::test]
+async fn a_head_is_that_of_its_record() {
+    let (_models, registry) = models();
+    let dir = tempfile::tempdir().unwrap();
+    let keeper = keeper(dir.path().to_owned());
+    let (_session, _untold) = keeper.open(opening(&registry, LONG), &registry).await.unwrap();
+    let (_, bytes) = keeper.store().unwrap().home().page(None, 1).unwrap().remove(0);
+    read(&bytes).unwrap();
+    for place in 0..bytes.len() {
+        let mut changed = bytes.clone();
+        changed[place] ^= 1 << (place % 8);
+        assert_eq!(read(&changed).unwrap_err().reason(), "STATE_CORRUPT", "byte {place}");
+    }
 }

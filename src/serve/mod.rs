@@ -27,6 +27,7 @@ pub mod service;
 pub mod session;
 pub mod store;
 pub mod telemetry;
+mod threads;
 mod wire;
 
 use config::Config;
@@ -37,6 +38,7 @@ use service::{Service, StartError};
 use std::{future::Future, io, net::SocketAddr, sync::Arc, time::Duration};
 use tokio::{
     net::{TcpListener, lookup_host},
+    task::{JoinHandle, spawn_blocking},
     time::{interval, sleep},
 };
 use tokio_util::sync::CancellationToken;
@@ -118,7 +120,7 @@ impl Server {
             load(&service, config.clone()).await?;
             grpc::report(&health, true).await;
             tracing::info!(address = %config.server.listen, "ready");
-            housekeeping(&service, &health, || metrics.run_upkeep()).await;
+            housekeeping(service.clone(), &health, || metrics.run_upkeep()).await;
             Ok(())
         };
         let served = tokio::select! {
@@ -137,7 +139,7 @@ impl Server {
         if !matches!(served, Err(ServerError::Accept)) && listening.await.is_err() {
             tracing::error!("the accept loop ended by panic");
         }
-        let stopping = tokio::task::spawn_blocking(move || service.stop(ENGINE_PATIENCE));
+        let stopping = spawn_blocking(move || service.stop(ENGINE_PATIENCE));
         if stopping.await.is_err() {
             tracing::error!("the engine's end panicked");
         }
@@ -156,17 +158,22 @@ async fn listen(address: &str) -> io::Result<TcpListener> {
 async fn load(service: &Arc<Service>, config: Config) -> Result<(), ServerError> {
     let warm = service.clone();
     let loading = move || Registry::load(&config.models).and_then(|registry| warm.warm_up(registry));
-    let loaded = tokio::task::spawn_blocking(loading).await;
+    let loaded = spawn_blocking(loading).await;
     service.set_registry(loaded.map_err(|panic| ServerError::Loading(io::Error::other(panic)))??);
     Ok(())
 }
 
-async fn housekeeping(service: &Service, health: &HealthReporter, upkeep: impl Fn()) {
+async fn housekeeping(service: Arc<Service>, health: &HealthReporter, upkeep: impl Fn()) {
     let mut ticks = interval(Duration::from_millis(service.config().sessions.reap_interval_ms));
-    let mut was_ready = true;
+    let (mut was_ready, mut reaping) = (true, None::<JoinHandle<()>>);
     loop {
         ticks.tick().await;
-        service.reap();
+        service.watch();
+        // A disk that hangs holds up the sessions' house-keeping, and nothing else.
+        if reaping.as_ref().is_none_or(JoinHandle::is_finished) {
+            let its = service.clone();
+            reaping = Some(spawn_blocking(move || its.reap()));
+        }
         upkeep();
         let is_ready = service.ready().is_ok();
         if is_ready != was_ready {

@@ -2,16 +2,15 @@
 
 mod layers;
 mod record;
+mod store;
 #[cfg(test)]
 mod tests;
 
 pub use layers::Origin;
 pub use record::RecordConfig;
+pub use store::StoreConfig;
 
-use crate::{
-    model::nn::Precision,
-    serve::{fault::Faults, store::Durability},
-};
+use crate::{model::nn::Precision, serve::fault::Faults};
 use layers::Layers;
 use serde::{Deserialize, Serialize};
 use std::{env, ffi::OsString, net::Ipv6Addr, path::Path, path::PathBuf, thread};
@@ -142,26 +141,6 @@ pub struct SessionsConfig {
     pub reap_interval_ms: u64,
 }
 
-/// Where sessions outlive the process.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct StoreConfig {
-    /// Directory of the embedded store; empty: sessions are in memory alone, and end with the process.
-    pub dir: PathBuf,
-    /// What a commit survives: nothing (`memory`), the end of the `process`, or that of the `power`.
-    pub durability: Durability,
-    /// Sessions that are kept, those in memory among them; one more is refused (STORE_FULL).
-    pub len_max: u64,
-    /// Bytes of its file. At a fifth of it, in records, no session more is opened (STORE_FULL), and those that are there go on.
-    pub bytes_max: u64,
-    /// Memory for its pages.
-    pub cache_bytes: usize,
-    /// Commits that wait for it; one more is refused (STORE_UNAVAILABLE).
-    pub queue_len_max: usize,
-    /// Sessions that are looked at for their end each `sessions.reap_interval_ms`.
-    pub sweep_len: usize,
-}
-
 /// The threads that run the networks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -286,20 +265,6 @@ impl Default for SessionsConfig {
             tombstone_ttl_ms: 600_000,
             tombstones_max: 100_000,
             reap_interval_ms: 1_000,
-        }
-    }
-}
-
-impl Default for StoreConfig {
-    fn default() -> Self {
-        Self {
-            dir: PathBuf::new(),
-            durability: Durability::Process,
-            len_max: 1_000_000,
-            bytes_max: 64 << 30,
-            cache_bytes: 64 << 20,
-            queue_len_max: 4096,
-            sweep_len: 2_000,
         }
     }
 }

@@ -2,6 +2,7 @@
 //! too long, has its place taken.
 
 use super::{Shared, Ticket, cost::Load, pulse::Pulse, queue::Room, tick::Batch};
+use crate::serve::threads::join_until;
 use std::{
     io, mem,
     panic::{AssertUnwindSafe, catch_unwind},
@@ -109,12 +110,7 @@ impl Crew {
     pub fn end(&mut self, patience: Duration) {
         let end = Instant::now() + patience;
         for Worker { thread, .. } in self.at_work.drain(..).chain(self.relieved.drain(..)) {
-            while !thread.is_finished() && Instant::now() < end {
-                sleep(Duration::from_millis(5));
-            }
-            if thread.is_finished() && thread.join().is_err() {
-                tracing::error!("an engine thread ended by panic");
-            }
+            join_until(thread, end);
         }
     }
 

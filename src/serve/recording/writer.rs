@@ -7,7 +7,7 @@ use super::{
 };
 use crate::{
     model::nn::Precision,
-    serve::{config::RecordConfig, options::OptionsPatch, session::Record, store::unix_ms},
+    serve::{config::RecordConfig, options::OptionsPatch, session::Record, store::unix_ms, threads::join_until},
 };
 use parking_lot::Mutex;
 use std::{
@@ -21,6 +21,8 @@ use std::{
 
 /// How often it is tried whether a recording can go on.
 const RETRY: Duration = Duration::from_secs(1);
+/// At the end, what waits has so long to be written.
+const PATIENCE: Duration = Duration::from_secs(5);
 /// Bytes that are written at once.
 const WRITE_LEN: usize = 1 << 20;
 
@@ -70,11 +72,12 @@ impl Writer {
         self.recorder.clone()
     }
 
-    /// Writes what waits, and ends. Blocks for that time.
+    /// Writes what waits, and ends. Blocks for that time, but not for a disk that hangs.
     pub fn stop(&self) {
         self.recorder.close();
-        // A panic in it has been told.
-        let _ended = self.thread.lock().take().map(JoinHandle::join);
+        if let Some(thread) = self.thread.lock().take() {
+            join_until(thread, Instant::now() + PATIENCE);
+        }
     }
 }
 

@@ -130,9 +130,13 @@ impl Service {
         if self.is_alive() { Ok(()) } else { Err("a worker of the engine is silent".to_owned()) }
     }
 
-    /// House-keeping, to be called every `sessions.reap_interval_ms`.
-    pub fn reap(&self) {
+    /// Sees to the engine's threads; to be called every `sessions.reap_interval_ms`.
+    pub fn watch(&self) {
         self.engine.watch();
+    }
+
+    /// Sees to the sessions; to be called as often, from a thread that may block: see [`Keeper::reap`].
+    pub fn reap(&self) {
         self.keeper.reap();
     }
 

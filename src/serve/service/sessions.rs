@@ -7,7 +7,7 @@ use crate::{
         error::ServiceError,
         registry::Model,
         request::{ForkRequest, ImportRequest, ListRequest, OpenRequest, Opened, Page, ResetRequest},
-        session::{Handle, Opening, Record, Renewal, Standing, Summary, Untold, is_request_id},
+        session::{Handle, Opening, Record, Renewal, Standing, Summary, is_request_id},
     },
 };
 use std::{
@@ -87,10 +87,8 @@ impl Service {
         ttl: Duration,
         request_id: String,
     ) -> Result<Opened, ServiceError> {
-        let is_named = !request_id.is_empty();
         let opening = Opening { model: model.name.clone(), agent: model.agent.clone(), episode, standing, ttl, request_id, known: None };
-        let session = self.keeper.open(opening, self.registry()?).await?;
-        let untold = (!is_named).then(|| Untold::new(self.keeper.table().clone(), session.clone()));
+        let (session, untold) = self.keeper.open(opening, self.registry()?).await?;
         Ok(Opened { session: session.summary(Instant::now()), model, untold })
     }
 

@@ -13,12 +13,7 @@ use std::sync::Arc;
 
 impl Session {
     pub(super) fn version(&self, slot: &Slot) -> Version {
-        self.version_at(slot.resets, slot.committed.step)
-    }
-
-    fn version_at(&self, episode: u64, step: u64) -> Version {
-        let model = self.agent.spec().digest.get(..16).and_then(|digits| u64::from_str_radix(digits, 16).ok()).unwrap_or_default();
-        Version { model, episode, step }
+        Version::at(&self.agent.spec().digest, slot.resets, slot.committed.step)
     }
 
     /// As it is opened.
@@ -78,8 +73,7 @@ impl Session {
         let (model, model_digest) = (self.model.to_string(), self.agent.spec().digest.clone());
         let record = Record { model, model_digest, ttl_ms: self.ttl.as_millis() as u64, step, resets, reset_ids, episode, last };
         let kept = Kept { id: self.id, request_id: self.request_id.clone(), opened: self.opened, touched: unix_ms(), record };
-        let mut bytes = self.version_at(resets, step).bytes().to_vec();
-        bytes.extend(kept.write().map_err(|error| ServiceError::internal(&error))?);
+        let bytes = kept.write().map_err(|error| ServiceError::internal(&error))?;
         let name = name_of(&self.request_id).filter(|_| from.is_none());
         Ok(Write { handle: self.handle, change: Change::Keep { from, bytes, name } })
     }

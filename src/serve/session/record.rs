@@ -9,7 +9,7 @@ use crate::{
     model::agent::{Agent, Chunk, Episode},
     serve::{
         error::ServiceError,
-        store::{UnixMs, unix_ms},
+        store::{HEAD_LEN as STORE_HEAD_LEN, Head, UnixMs, Version, unix_ms},
     },
 };
 use crc::{CRC_32_ISCSI, Crc};
@@ -150,24 +150,28 @@ pub struct Kept {
 }
 
 impl Kept {
-    /// As bytes.
+    /// As a store keeps it: the head, and what it was made of.
     ///
     /// # Errors
     /// If the format cannot express it, which is a defect.
     pub fn write(&self) -> Result<Vec<u8>, rmp_serde::encode::Error> {
-        write(*KEPT, self)
+        Ok([&self.head().bytes()[..], &write(*KEPT, self)?].concat())
     }
 
-    /// From bytes.
+    /// From what a store has kept. The head has no checksum of its own: it has to be that of what follows.
     ///
     /// # Errors
     /// [`Unreadable`].
     pub fn read(bytes: &[u8]) -> Result<Self, Unreadable> {
-        read(KEPT, bytes)
+        let kept: Self = read(KEPT, bytes.get(STORE_HEAD_LEN..).ok_or(Unreadable::Damaged)?)?;
+        if Head::of(bytes) == Some(kept.head()) { Ok(kept) } else { Err(Unreadable::Damaged) }
     }
-}
 
-impl Kept {
+    fn head(&self) -> Head {
+        let Record { model_digest, ttl_ms, step, resets, .. } = &self.record;
+        Head { version: Version::at(model_digest, *resets, *step), touched: self.touched, ttl_ms: *ttl_ms }
+    }
+
     /// The session in numbers, as far as what is kept tells.
     pub fn summary(self, handle: Handle, in_full: bool) -> Summary {
         let Self { id: _, request_id: _, opened, touched, record } = self;

@@ -11,7 +11,10 @@ pub use embedded::{Embedded, Options};
 pub use writer::{Outcome, Store};
 
 use crate::serve::session::Handle;
-use std::time::SystemTime;
+use std::{
+    sync::LazyLock,
+    time::{Instant, SystemTime},
+};
 
 /// Where a session stands: what the next commit goes on from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -28,6 +31,12 @@ pub struct Version {
 pub const VERSION_LEN: usize = 24;
 
 impl Version {
+    /// Of a session on the model of this digest.
+    pub fn at(model_digest: &str, episode: u64, step: u64) -> Self {
+        let model = model_digest.get(..16).and_then(|digits| u64::from_str_radix(digits, 16).ok()).unwrap_or_default();
+        Self { model, episode, step }
+    }
+
     /// As bytes.
     pub fn bytes(self) -> [u8; VERSION_LEN] {
         let Self { model, episode, step } = self;
@@ -71,11 +80,11 @@ pub enum Ending {
 /// What becomes of a session's place.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Change {
-    /// It holds these bytes, which begin with the version.
+    /// It holds these bytes.
     Keep {
         /// What it goes on from: None where there is nothing yet.
         from: Option<Version>,
-        /// The version, and the session behind it.
+        /// The [`Head`], and the session behind it.
         bytes: Vec<u8>,
         /// The name of the request that opened it, where this opens it.
         name: Option<Name>,
@@ -97,9 +106,56 @@ pub type Name = [u8; 16];
 /// Wall clock, in milliseconds since 1970.
 pub type UnixMs = u64;
 
-/// Now.
+/// Now, by the wall clock as it stood when it was first asked, and the time that went by since: a clock that is set must not end sessions.
 pub fn unix_ms() -> UnixMs {
-    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_millis() as UnixMs)
+    static FIRST: LazyLock<(Instant, UnixMs)> = LazyLock::new(|| {
+        let wall = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        (Instant::now(), wall.map_or(0, |since| since.as_millis() as UnixMs))
+    });
+    let (at, wall) = &*FIRST;
+    wall + at.elapsed().as_millis() as UnixMs
+}
+
+/// What stands before a session's bytes, for whoever looks at many of them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Head {
+    /// Where the session stands.
+    pub version: Version,
+    /// When it was touched, as far as commits tell.
+    pub touched: UnixMs,
+    /// Idle time to live, in milliseconds.
+    pub ttl_ms: u64,
+}
+
+/// Bytes of a [`Head`].
+pub const HEAD_LEN: usize = VERSION_LEN + 16;
+
+impl Head {
+    /// As bytes; the version first.
+    pub fn bytes(self) -> [u8; HEAD_LEN] {
+        let Self { version, touched, ttl_ms } = self;
+        let mut bytes = [0; HEAD_LEN];
+        bytes[..VERSION_LEN].copy_from_slice(&version.bytes());
+        for (place, part) in bytes[VERSION_LEN..].as_chunks_mut().0.iter_mut().zip([touched, ttl_ms]) {
+            *place = part.to_le_bytes();
+        }
+        bytes
+    }
+
+    /// From the beginning of what a home keeps.
+    pub fn of(bytes: &[u8]) -> Option<Self> {
+        let (times, _) = bytes.get(VERSION_LEN..HEAD_LEN)?.as_chunks::<8>();
+        let [touched, ttl_ms] = *times else { return None };
+        let [touched, ttl_ms] = [touched, ttl_ms].map(u64::from_le_bytes);
+        Some(Self { version: Version::of(bytes)?, touched, ttl_ms })
+    }
+
+    /// Whether it has been idle for too long, for a server that began then. No session expires for what went by before: its client could not reach it,
+    /// and by another clock it may have been touched in times to come.
+    pub fn has_expired(self, began: UnixMs, now: UnixMs) -> bool {
+        let touched = if self.touched > now { began } else { self.touched.max(began) };
+        now >= touched.saturating_add(self.ttl_ms)
+    }
 }
 
 /// A change of one session's place.
@@ -114,7 +170,7 @@ pub struct Write {
 /// What a home has of a session.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// Its bytes, which begin with its version.
+    /// Its bytes, which begin with its [`Head`].
     Kept(Vec<u8>),
     /// It has ended so.
     Ended(Ending),
@@ -169,6 +225,12 @@ pub trait Home: Send + Sync + 'static {
     /// If nothing could be read.
     fn page(&self, after: Option<Handle>, len: usize) -> Result<Vec<(Handle, Vec<u8>)>, StoreError>;
 
+    /// The same of their heads alone.
+    ///
+    /// # Errors
+    /// If nothing could be read.
+    fn heads(&self, after: Option<Handle>, len: usize) -> Result<Vec<(Handle, Head)>, StoreError>;
+
     /// Forgets endings that are older than this; says how many.
     ///
     /// # Errors
@@ -206,5 +268,23 @@ impl Ending {
             Ending::Expired => "expired",
             Ending::Evicted => "evicted",
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Time before this server began counts for nobody, whatever a clock said then.
+    #[test]
+    fn a_session_expires_by_the_time_in_which_it_could_be_reached() {
+        let head = |touched| Head { version: Version { model: 1, episode: 2, step: 3 }, touched, ttl_ms: 10 };
+        assert_eq!(Head::of(&head(7).bytes()), Some(head(7)));
+        assert_eq!(Head::of(&head(7).bytes()[..HEAD_LEN - 1]), None);
+        // (touched, began, now)
+        let expired = |touched, began, now| head(touched).has_expired(began, now);
+        assert!(!expired(100, 50, 109) && expired(100, 50, 110), "idle for its time to live");
+        assert!(!expired(100, 500, 509) && expired(100, 500, 510), "of which only what came after the start counts");
+        assert!(!expired(9_000, 500, 509) && expired(9_000, 500, 510), "by a clock that was ahead");
     }
 }

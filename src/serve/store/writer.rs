@@ -1,7 +1,7 @@
 //! One thread that writes: what arrives while it is at work goes into its next transaction (group commit).
 
 use super::{Home, Place, Refused, Size, StoreError, Write};
-use crate::serve::session::Handle;
+use crate::serve::{session::Handle, threads::join_until};
 use parking_lot::{Condvar, Mutex};
 use std::{
     collections::VecDeque,
@@ -129,15 +129,14 @@ impl Store {
         }
     }
 
-    /// Writes what still waits, and takes nothing more. Blocks for that time.
+    /// Writes what still waits, and takes nothing more. Blocks for that time, and no longer than for a commit of a disk that works.
     pub fn close(&self) {
         self.queue.waiting.lock().closed = true;
         self.queue.arrived.notify_one();
         let thread = self.thread.lock().take();
         // Whoever is told may be the last who holds the store.
-        let ended = thread.filter(|thread| thread.thread().id() != thread::current().id()).map(JoinHandle::join);
-        if ended.is_some_and(|ended| ended.is_err()) {
-            tracing::error!("the store's thread ended by panic");
+        if let Some(thread) = thread.filter(|thread| thread.thread().id() != thread::current().id()) {
+            join_until(thread, Instant::now() + PATIENCE);
         }
     }
 }

@@ -9,7 +9,7 @@ mod medium;
 #[cfg(test)]
 mod tests;
 
-use super::{Change, Durability, Ending, Home, Name, Place, Refused, Size, StoreError, UnixMs, Version, Write};
+use super::{Change, Durability, Ending, Head, Home, Name, Place, Refused, Size, StoreError, UnixMs, Version, Write};
 use crate::serve::session::Handle;
 use medium::Medium;
 use parking_lot::{Mutex, RwLock};
@@ -151,6 +151,21 @@ impl Embedded {
             *database = Some(fresh);
         }
         Ok(())
+    }
+}
+
+impl Embedded {
+    /// Something of up to `len` sessions with handles above `after`, in order of handle.
+    fn behind<T>(&self, after: Option<Handle>, len: usize, of: impl Fn(&[u8]) -> T) -> Result<Vec<(Handle, T)>, StoreError> {
+        let behind = after.map_or(Bound::Unbounded, |handle| Bound::Excluded(handle.bytes()));
+        self.with(|database| {
+            let found = database.begin_read()?.open_table(SESSIONS)?.range((behind, Bound::Unbounded))?.take(len);
+            let entry = |entry: Result<(redb::AccessGuard<Key>, redb::AccessGuard<&[u8]>), redb::StorageError>| {
+                let (handle, bytes) = entry?;
+                Ok((Handle::from_bytes(handle.value()), of(bytes.value())))
+            };
+            found.map(entry).collect()
+        })
     }
 }
 
@@ -315,18 +330,23 @@ impl Home for Embedded {
     }
 
     fn page(&self, after: Option<Handle>, len: usize) -> Result<Vec<(Handle, Vec<u8>)>, StoreError> {
-        let behind = after.map_or(Bound::Unbounded, |handle| Bound::Excluded(handle.bytes()));
-        self.with(|database| {
-            let found = database.begin_read()?.open_table(SESSIONS)?.range((behind, Bound::Unbounded))?.take(len);
-            let entry = |entry: Result<(redb::AccessGuard<Key>, redb::AccessGuard<&[u8]>), redb::StorageError>| {
-                let (handle, bytes) = entry?;
-                Ok((Handle::from_bytes(handle.value()), bytes.value().to_vec()))
-            };
-            found.map(entry).collect()
-        })
+        self.behind(after, len, <[u8]>::to_vec)
+    }
+
+    fn heads(&self, after: Option<Handle>, len: usize) -> Result<Vec<(Handle, Head)>, StoreError> {
+        let heads = self.behind(after, len, Head::of)?;
+        Ok(heads.into_iter().filter_map(|(handle, head)| Some((handle, head?))).collect())
     }
 
     fn forget_endings(&self, before: UnixMs) -> Result<usize, StoreError> {
+        // Most often there is none, and a transaction would keep commits waiting.
+        let is_there = |database: &Database| {
+            let endings = database.begin_read()?.open_table(ENDINGS)?;
+            Ok(endings.iter()?.any(|entry| entry.is_ok_and(|(_, ended)| ended.value().1 < before)))
+        };
+        if !self.with(is_there)? {
+            return Ok(0);
+        }
         self.with(|database| {
             let transaction = database.begin_write()?;
             let mut forgotten = 0;
