@@ -135,7 +135,7 @@ impl Service {
         self.engine.watch();
     }
 
-    /// Sees to the sessions; to be called as often, from a thread that may block: see [`Keeper::reap`].
+    /// Sees to the sessions; to be called as often, from a thread that may block, for as long as a failing disk likes.
     pub fn reap(&self) {
         self.keeper.reap();
     }
