@@ -41,7 +41,7 @@ fn start(cli: Cli) -> Result<ExitCode> {
 }
 
 fn run(flags: Run) -> Result<ExitCode> {
-    let Run { recipe, seed, out, data, with, mut overrides, stop_after_steps, data_memory_mib, keep_best } = flags;
+    let Run { recipe, seed, out, data, with, mut overrides, stop_after_steps, data_memory_mib, keep_best, share_stages } = flags;
     overrides.extend(seed.map(|seed| format!("seed={seed}")));
     let recipe = Recipe::read(&recipe, &Changes { with, overrides, data })?;
     let out = out.unwrap_or_else(|| PathBuf::from("runs").join(format!("{}-seed{}", recipe.name, recipe.seed)));
@@ -51,7 +51,7 @@ fn run(flags: Run) -> Result<ExitCode> {
         move || await_signals(&stop, &signal)
     });
     let clock = Box::new(|| SystemTime::UNIX_EPOCH.elapsed().map_or(0.0, |time| time.as_secs_f64()));
-    let outcome = train::run(recipe, Options { out, stop_after_steps, keep_best, stop, data_memory_mib, clock })?;
+    let outcome = train::run(recipe, Options { out, stop_after_steps, keep_best, share_stages, stop, data_memory_mib, clock })?;
     let signal = signal.load(Ordering::Relaxed);
     Ok(if outcome == Outcome::Stopped && signal > 0 { ExitCode::from(128 + signal) } else { ExitCode::SUCCESS })
 }

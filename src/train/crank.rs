@@ -11,6 +11,7 @@ use super::{
         stages::{Keeps, Stage},
     },
     resume::{Kept, Store},
+    shared::Shared,
     ship::{self, Product},
 };
 use anyhow::{Result, bail};
@@ -28,6 +29,10 @@ pub struct Crank<'a> {
     pub task: &'a Task,
     /// Where the state is kept.
     pub store: Store,
+    /// Where first stages are left for other runs, if they are.
+    pub shared: Option<Shared>,
+    /// That another run spent on stages which this one begins behind.
+    pub seconds: f64,
     /// What is said.
     pub log: Log,
     /// Where the checkpoint goes.
@@ -73,6 +78,9 @@ impl Crank<'_> {
             }
             if self.passes_gate(learner)? {
                 learner.enter_next(self.task)?;
+                if let Some(shared) = &self.shared {
+                    shared.leave(self.task, &learner.snapshot(), self.seconds + self.log.seconds())?;
+                }
             } else {
                 learner.begin_anew(self.task)?;
             }

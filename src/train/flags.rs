@@ -69,6 +69,10 @@ pub struct Run {
     /// Keep the checkpoint of the least held-out loss of the last stage as well, in OUT-best beside OUT; it is served like any other
     #[arg(long)]
     pub keep_best: bool,
+    /// Leave in this directory what the first stages come to that look for what is hidden, and begin behind them where another run of the same
+    /// data, seed and stages has left it: the results are the same, and a sweep over planners finds a context once
+    #[arg(long, value_name = "DIR")]
+    pub share_stages: Option<PathBuf>,
     /// Stop after this many steps as if interrupted; the same command goes on
     #[arg(long, value_name = "N")]
     pub stop_after_steps: Option<usize>,

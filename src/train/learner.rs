@@ -6,6 +6,7 @@ use super::{
     position::Position,
     recipe::stages::{Group, Stage},
     resume::{KEPT, Kept, Notes, PRIORITIES, Snapshot, State, restore_vars},
+    shared::Came,
 };
 use crate::model::{Networks, critic::Critic, nn::params::Params};
 use anyhow::{Result, ensure};
@@ -49,6 +50,18 @@ impl Learner {
         let vars = params.vars();
         let (adam, ema) = equip(&task.recipe.stages[position.stage], &vars)?;
         Ok(Self { networks, vars, adam, ema, kept: BTreeMap::new(), priorities: Vec::new(), position, notes: Notes::default() })
+    }
+
+    /// A learner that begins behind stages which another run has been through.
+    ///
+    /// # Errors
+    /// If they do not fit the recipe.
+    pub fn after(task: &Task, came: &Came) -> Result<Self> {
+        let mut learner = Self { notes: came.notes.clone(), ..Self::fresh(task, came.position)? };
+        came.into_vars(&learner.vars)?;
+        // The average begins with the weights as they are now.
+        (learner.adam, learner.ema) = equip(&task.recipe.stages[came.position.stage], &learner.vars)?;
+        Ok(learner)
     }
 
     /// The learner of a state on disk.

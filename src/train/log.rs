@@ -32,8 +32,10 @@ pub struct Log {
     bar: ProgressBar,
     clock: Box<Clock>,
     pace: Pace,
-    sums: Vec<(&'static str, f64)>,
-    count: usize,
+    /// Of each scalar since the last line: sum and count, for a loss need not be evaluated at every step.
+    sums: Vec<(&'static str, f64, usize)>,
+    /// When this process opened it.
+    opened: f64,
 }
 
 /// How fast a stage goes.
@@ -94,7 +96,8 @@ impl Log {
         fs::write(&path, &kept).with_context(|| format!("cannot write {}", path.display()))?;
         let last = kept.lines().next_back().unwrap_or_default().to_owned();
         let lines = OpenOptions::new().append(true).open(&path)?;
-        let events = EventWriter::create(dir, position.total() as u64, clock())?;
+        let opened = clock();
+        let events = EventWriter::create(dir, position.total() as u64, opened)?;
         let bar = ProgressBar::with_draw_target(Some(0), ProgressDrawTarget::stderr());
         let template = "{prefix} {wide_bar} {pos}/{len}  {msg}  {rate}, {eta_precise} left";
         let style = ProgressStyle::with_template(template).expect("the template is constant: is a bug");
@@ -102,13 +105,14 @@ impl Log {
         bar.set_style(style.with_key("rate", |state: &ProgressState, out: &mut dyn fmt::Write| {
             let _nobody_reads = out.write_str(&rate_text(state.per_sec()));
         }));
-        Ok(Self { stages, lines, last, events, bar, clock, pace: Pace::default(), sums: Vec::new(), count: 0 })
+        Ok(Self { stages, lines, last, events, bar, clock, pace: Pace::default(), sums: Vec::new(), opened })
     }
 
     /// A stage begins at `position` and has `steps` steps.
     pub fn begin(&mut self, position: &Position, steps: usize) {
         let now = (self.clock)();
         let stage = self.stages[position.stage].clone();
+        self.sums.clear();
         self.bar.set_prefix(stage.clone());
         self.pace = Pace { stage, steps, from: (position.step, now), said: now };
         self.bar.set_length(steps as u64);
@@ -130,17 +134,17 @@ impl Log {
             self.pace.said = now;
             tell(&self.pace.text(position, now));
         }
-        if self.sums.len() != scalars.len() {
-            self.sums = scalars.iter().map(|(name, _)| (*name, 0.0)).collect();
-            self.count = 0;
+        for (name, value) in scalars {
+            match self.sums.iter_mut().find(|(known, ..)| known == name) {
+                Some((_, sum, count)) => (*sum, *count) = (*sum + value, *count + 1),
+                None => self.sums.push((name, *value, 1)),
+            }
         }
-        self.sums.iter_mut().zip(scalars).for_each(|(sum, (_, value))| sum.1 += value);
-        self.count += 1;
         if !position.step.is_multiple_of(every) {
             return Ok(());
         }
-        let count = std::mem::take(&mut self.count) as f64;
-        let means: Vec<(&'static str, f64)> = std::mem::take(&mut self.sums).into_iter().map(|(name, sum)| (name, sum / count)).collect();
+        let sums = std::mem::take(&mut self.sums);
+        let means: Vec<(&'static str, f64)> = sums.into_iter().map(|(name, sum, count)| (name, sum / count as f64)).collect();
         self.write(position, &means)
     }
 
@@ -174,6 +178,11 @@ impl Log {
             self.bar.set_message(text.first().cloned().unwrap_or_default());
         }
         Ok(())
+    }
+
+    /// Since this process opened it.
+    pub fn seconds(&self) -> f64 {
+        (self.clock)() - self.opened
     }
 
     /// A sentence for the reader.

@@ -26,6 +26,9 @@ pub mod resume;
 pub mod ridge;
 #[cfg(test)]
 mod same_tests;
+pub mod shared;
+#[cfg(test)]
+mod shared_tests;
 mod ship;
 #[cfg(test)]
 mod skill_tests;
@@ -51,6 +54,7 @@ use log::{Clock, Log};
 use position::Position;
 use recipe::{Recipe, losses::Loss};
 use resume::Store;
+use shared::{Came, Shared};
 use std::{
     fs::{self, File},
     io,
@@ -69,6 +73,8 @@ pub struct Options {
     pub stop_after_steps: Option<usize>,
     /// Keep the checkpoint of the least held-out loss of the last stage as well, in a directory beside `out`: its name with `-best`.
     pub keep_best: bool,
+    /// Where first stages lie that runs of the same data and seed share; none: every run goes through all of its own.
+    pub share_stages: Option<PathBuf>,
     /// Set by the binary when the user interrupts: the run saves its state and ends after the step in progress.
     pub stop: Arc<AtomicBool>,
     /// Rows of the data set that take more than this are kept in a file beside the training state; none: half of the memory that is free.
@@ -229,12 +235,45 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     let store = Store::new(&dir, &task.recipe, &task.dataset_digest);
     let state = store.load()?;
     let resumed = state.as_ref().map(|state| state.position);
-    let mut learner = match state {
-        Some(state) => Learner::resumed(&task, state)?,
-        None => Learner::fresh(&task, Position::START)?,
+    let shared = options.share_stages.map(Shared::new).transpose()?;
+    let came = if state.is_none() { shared.as_ref().map(|shared| shared.find(&task)).transpose()?.flatten() } else { None };
+    let mut learner = match (state, &came) {
+        (Some(state), _) => Learner::resumed(&task, state)?,
+        (None, Some(came)) => Learner::after(&task, came)?,
+        (None, None) => Learner::fresh(&task, Position::START)?,
     };
     let stages = task.recipe.stages.iter().map(|stage| stage.name.clone()).collect();
-    let log = Log::open(&dir, stages, &learner.position, options.clock)?;
+    let mut log = Log::open(&dir, stages, &learner.position, options.clock)?;
+    let best = options.keep_best.then(|| best_dir(&options.out));
+    introduce(&task, &log, &dir, (&options.out, best.as_ref()));
+    if let Some(position) = resumed {
+        log.say(&format!("going on at {} step {}", task.recipe.stages[position.stage].name, position.step));
+        learner.notes.changes.iter().for_each(|change| log.say(&change.to_string()));
+    }
+    if let Some(Came { position, seconds, .. }) = &came {
+        let names = task.recipe.stages[..position.stage].iter().map(|stage| stage.name.as_str()).collect::<Vec<_>>().join(", ");
+        log.say(&format!("{names}: taken from another run, which it took {seconds:.0} s"));
+        log.write(position, &[("shared_seconds", *seconds)])?;
+        store.save(&learner.snapshot())?;
+    }
+    let out = &options.out;
+    let mut crank = Crank {
+        task: &task,
+        store,
+        shared,
+        seconds: came.map_or(0.0, |came| came.seconds),
+        log,
+        out,
+        best,
+        finished: None,
+        stop: options.stop,
+        steps_left: options.stop_after_steps,
+    };
+    crank.run(&mut learner)
+}
+
+/// What a person should know before the first step: of the data, of actions, and where everything goes.
+fn introduce(task: &Task, log: &Log, dir: &Path, (out, best): (&PathBuf, Option<&PathBuf>)) {
     task.notes.iter().for_each(|note| log.say(note));
     let Sides { train, held_out } = &task.split.episodes;
     let play = train.iter().chain(held_out).filter(|episode| episode.play).count();
@@ -244,21 +283,13 @@ pub fn run(recipe: Recipe, options: Options) -> Result<Outcome> {
     for (index, notable) in task.action_columns.iter().map(ActionColumn::notable).enumerate() {
         notable.into_iter().for_each(|notable| log.say(&format!("warning: actions, column {index}: {notable}")));
     }
-    log.say(&format!("log: {}; curves: tensorboard --logdir {}", dir.join("log.jsonl").display(), options.out.display()));
+    log.say(&format!("log: {}; curves: tensorboard --logdir {}", dir.join("log.jsonl").display(), out.display()));
     let named = |dir: &Path| dir.file_name().and_then(|name| name.to_str()).is_some_and(is_name);
-    for dir in [Some(&options.out), options.keep_best.then(|| best_dir(&options.out)).as_ref()].into_iter().flatten() {
+    for dir in [Some(out), best].into_iter().flatten() {
         if !named(dir) {
             log.say(&format!("{}: the server will not serve a directory of this name (1 to 64 of A-Z a-z 0-9 _ . -)", dir.display()));
         }
     }
-    if let Some(position) = resumed {
-        log.say(&format!("going on at {} step {}", task.recipe.stages[position.stage].name, position.step));
-        learner.notes.changes.iter().for_each(|change| log.say(&change.to_string()));
-    }
-    let best = options.keep_best.then(|| best_dir(&options.out));
-    let out = &options.out;
-    let mut crank = Crank { task: &task, store, log, out, best, finished: None, stop: options.stop, steps_left: options.stop_after_steps };
-    crank.run(&mut learner)
 }
 
 /// Beside the run, so that a server over the directory of both serves both.

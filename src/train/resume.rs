@@ -161,7 +161,8 @@ impl Store {
     }
 }
 
-fn write_beside(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+/// Writes beside the old file and renames it: a kill at any moment leaves one of the two.
+pub(super) fn write_beside(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let beside = path.with_extension("partial");
     let mut file = fs::File::create(&beside)?;
     std::io::Write::write_all(&mut file, bytes)?;

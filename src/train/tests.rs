@@ -38,7 +38,7 @@ fn train_within(data_memory_mib: Option<u64>, overrides: &[&str], out: &Path, st
 pub(super) fn options(out: &Path, stop_after_steps: Option<usize>) -> Options {
     let stop = Arc::new(AtomicBool::new(false));
     let out = out.to_path_buf();
-    Options { out, stop_after_steps, keep_best: false, stop, data_memory_mib: None, clock: Box::new(|| 0.0) }
+    Options { out, stop_after_steps, keep_best: false, share_stages: None, stop, data_memory_mib: None, clock: Box::new(|| 0.0) }
 }
 
 pub(super) fn train_as(overrides: &[&str], options: Options) -> anyhow::Result<Outcome> {
@@ -477,4 +477,25 @@ fn wrong_data_sets_are_refused_before_training() {
         error.contains("0 of 12 episode(s)") && error.contains("`losses.elbo.length` + 1") && error.contains("longest has 24"),
         "{error}"
     );
+}
+
+/// A loss that is evaluated at every second step counts twice there, and not at all in between.
+#[test]
+fn a_loss_need_not_be_evaluated_at_each_step() {
+    let dir = tempfile::tempdir().unwrap();
+    let ships = |name: &str, keys: &[&str]| {
+        train(&[&["stages.identify.steps=1"], keys].concat(), &dir.path().join(name), None).unwrap();
+        shipped(&dir.path().join(name))
+    };
+    let [half, whole, none] = ["{denoise = 1.0, elbo = 0.05}", "{denoise = 1.0, elbo = 0.1}", "{denoise = 1.0}"]
+        .map(|weights| format!("stages.denoise.minimizes={weights}"));
+    let (once, every) = ("stages.denoise.steps=1", "stages.denoise.every={elbo = 2}");
+    let there = ships("there", &[once, &whole]);
+    assert!(there == ships("double", &[once, &half, every]), "it counts twice where it is evaluated");
+    assert!(there != ships("none", &[once, &none]));
+    ships("rare", &["stages.denoise.steps=5", "stages.denoise.every={elbo = 3}", "log_every=1"]);
+    let log = fs::read_to_string(dir.path().join("rare/training/log.jsonl")).unwrap();
+    let steps = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+    let steps = steps.filter(|line| line["stage"] == "denoise" && line.get("grad_norm").is_some());
+    assert_eq!(steps.map(|line| line.get("elbo").is_some()).collect::<Vec<_>>(), [true, false, false, true, false]);
 }

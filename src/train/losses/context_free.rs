@@ -37,7 +37,7 @@ pub struct ContextFreeLoss<'a> {
 impl<'a> ContextFreeLoss<'a> {
     /// As the stage with this index has it; none where it does not.
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
-        let weight = task.recipe.stages.get(stage)?.weight(Loss::ContextFree);
+        let weight = task.recipe.stages.get(stage)?.weight_there(Loss::ContextFree);
         let config = task.recipe.losses.context_free.as_ref().filter(|_| weight > 0.0)?;
         let episodes = task.split.episodes.only(config.episodes);
         Some(Self { task, weight, batch: config.batch, places: Places::new(&episodes.train, 0, 2), episodes })

@@ -43,7 +43,7 @@ pub struct CriticLoss<'a> {
 impl<'a> CriticLoss<'a> {
     /// As the stage with this index has it; none where it does not.
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
-        let weight = task.recipe.stages.get(stage)?.weight(Loss::Critic);
+        let weight = task.recipe.stages.get(stage)?.weight_there(Loss::Critic);
         let config = task.recipe.losses.critic.as_ref().filter(|_| weight > 0.0)?;
         let shape = window_shape(task, config.batch);
         let shape = WindowShape { plan: Diffusion { horizon: 1, ..shape.plan.clone() }, ..shape };

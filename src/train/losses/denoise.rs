@@ -53,7 +53,7 @@ impl<'a> DenoiseLoss<'a> {
     /// As the stage with this index has it; none where it does not.
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
         let stage = task.recipe.stages.get(stage)?;
-        let (weight, moves_latents) = (stage.weight(Loss::Denoise), stage.trains.contains_key(&Group::Latent));
+        let (weight, moves_latents) = (stage.weight_there(Loss::Denoise), stage.trains.contains_key(&Group::Latent));
         (weight > 0.0).then(|| Self::new(task, weight, moves_latents))
     }
 

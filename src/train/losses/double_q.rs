@@ -73,7 +73,7 @@ impl<'a> Offers<'a> {
 impl<'a> DoubleQLoss<'a> {
     /// As the stage with this index has it; none where it does not.
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
-        let weight = task.recipe.stages.get(stage)?.weight(Loss::DoubleQ);
+        let weight = task.recipe.stages.get(stage)?.weight_there(Loss::DoubleQ);
         let config = task.recipe.losses.double_q.as_ref().filter(|_| weight > 0.0)?;
         let shape = WindowShape { hide: Hide::NOTHING, ..window_shape(task, config.batch) };
         let (steps, episodes) = (task.config.method.plan.diffused.code_steps()?, &task.split.episodes);

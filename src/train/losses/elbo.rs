@@ -42,7 +42,7 @@ impl<'a> ElboLoss<'a> {
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
         let (config, latent) = (task.recipe.losses.elbo.as_ref()?, task.config.method.latent.gru()?);
         let (earlier, from) = task.recipe.stages.split_at(stage);
-        let weight = from.first().map(|stage| stage.weight(Loss::Elbo)).filter(|weight| *weight > 0.0)?;
+        let weight = from.first().map(|stage| stage.weight_there(Loss::Elbo)).filter(|weight| *weight > 0.0)?;
         let shape = BlockShape {
             batch: config.batch,
             len: latent.block_len() + 1 + config.length,

@@ -49,7 +49,7 @@ pub struct InverseLoss<'a> {
 impl<'a> InverseLoss<'a> {
     /// As the stage with this index has it; none where it does not.
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
-        let weight = task.recipe.stages.get(stage)?.weight(Loss::Inverse);
+        let weight = task.recipe.stages.get(stage)?.weight_there(Loss::Inverse);
         let loss = task.recipe.losses.inverse.as_ref().filter(|_| weight > 0.0)?;
         let (shape, episodes) = (window_shape(task, loss.batch), task.split.episodes.only(IMITATED));
         let process = task.config.method.head.level_max().map(Process::cosine);

@@ -150,28 +150,29 @@ impl<'a> Objective<'a> {
     /// The work of a step; batches are drawn here, in the order of [`super::recipe::losses::Loss`].
     fn jobs<'b>(&'b self, learner: &'b Learner, slow: Option<&'b Critic>, step: usize, rng: &mut Philox) -> Result<Vec<Job<'b>>> {
         let (networks, mut jobs) = (&learner.networks, Vec::new());
-        if let Some(denoise) = &self.denoise {
+        let due = |loss: Loss| self.stage.evaluates(loss, step);
+        if let Some(denoise) = self.denoise.as_ref().filter(|_| due(Loss::Denoise)) {
             jobs.extend(denoise.jobs(networks, rng)?);
         }
-        if let Some(elbo) = &self.elbo {
+        if let Some(elbo) = self.elbo.as_ref().filter(|_| due(Loss::Elbo)) {
             jobs.push(elbo.job(networks, step, rng)?);
         }
-        if let Some(context_free) = &self.context_free {
+        if let Some(context_free) = self.context_free.as_ref().filter(|_| due(Loss::ContextFree)) {
             jobs.push(context_free.job(networks, rng)?);
         }
-        if let Some(inverse) = &self.inverse {
+        if let Some(inverse) = self.inverse.as_ref().filter(|_| due(Loss::Inverse)) {
             jobs.push(inverse.job(networks, rng)?);
         }
-        if let Some(value) = &self.value {
+        if let Some(value) = self.value.as_ref().filter(|_| due(Loss::Value)) {
             jobs.push(value.job(networks, rng)?);
         }
-        if let (Some(critic), Some(slow)) = (&self.critic, slow) {
+        if let (Some(critic), Some(slow)) = (self.critic.as_ref().filter(|_| due(Loss::Critic)), slow) {
             jobs.push(critic.job(networks, slow, rng)?);
         }
-        if let Some(skill) = &self.skill {
+        if let Some(skill) = self.skill.as_ref().filter(|_| due(Loss::Skill)) {
             jobs.push(skill.job(networks, rng)?);
         }
-        if let (Some(double_q), Some(slow)) = (&self.double_q, slow) {
+        if let (Some(double_q), Some(slow)) = (self.double_q.as_ref().filter(|_| due(Loss::DoubleQ)), slow) {
             jobs.push(double_q.job(networks, slow, &learner.priorities, rng)?);
         }
         Ok(jobs)

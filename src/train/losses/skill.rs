@@ -33,7 +33,7 @@ pub struct SkillLoss<'a> {
 impl<'a> SkillLoss<'a> {
     /// As the stage with this index has it; none where it does not.
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
-        let weight = task.recipe.stages.get(stage)?.weight(Loss::Skill);
+        let weight = task.recipe.stages.get(stage)?.weight_there(Loss::Skill);
         let config = task.recipe.losses.skill.as_ref().filter(|_| weight > 0.0)?;
         let (shape, episodes) = (window_shape(task, config.batch), task.split.episodes.only(IMITATED));
         Some(Self { config, weight, places: shape.places(&episodes.train), shape, episodes })

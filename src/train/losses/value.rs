@@ -39,7 +39,7 @@ pub struct ValueLoss<'a> {
 impl<'a> ValueLoss<'a> {
     /// As the stage with this index has it; none where it does not.
     pub fn of_stage(task: &'a Task, stage: usize) -> Option<Self> {
-        let weight = task.recipe.stages.get(stage)?.weight(Loss::Value);
+        let weight = task.recipe.stages.get(stage)?.weight_there(Loss::Value);
         let loss = task.recipe.losses.value.as_ref().filter(|_| weight > 0.0)?;
         let (shape, episodes) = (window_shape(task, loss.batch), task.split.episodes.only(IMITATED));
         let places = shape.places(&episodes.train);

@@ -90,6 +90,10 @@ pub struct Stage {
     pub steps: usize,
     /// The losses, each with its weight; 0 is off.
     pub minimizes: BTreeMap<Loss, f64>,
+    /// Losses that are evaluated at every so many steps alone, and then count for all of these (the "lazy regularization" of Karras et al. 2020,
+    /// arXiv:1912.04958, appendix B): what holds something in place need not do so at each step. Of a loss that is not minimized it says nothing.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub every: BTreeMap<Loss, usize>,
     /// The networks that move, each with a factor on the learning rate.
     pub trains: BTreeMap<Group, f64>,
     /// Networks that stand still after a share of the steps (the "freeze" ablation of the paper).
@@ -144,6 +148,21 @@ impl Stage {
         self.minimizes.get(&loss).copied().unwrap_or(0.0)
     }
 
+    /// Steps from one evaluation of a loss to the next.
+    pub fn every(&self, loss: Loss) -> usize {
+        self.every.get(&loss).copied().unwrap_or(1)
+    }
+
+    /// Whether a loss is evaluated at a step.
+    pub fn evaluates(&self, loss: Loss, step: usize) -> bool {
+        step.is_multiple_of(self.every(loss))
+    }
+
+    /// Weight of a loss at the steps that evaluate it.
+    pub fn weight_there(&self, loss: Loss) -> f64 {
+        self.weight(loss) * self.every(loss) as f64
+    }
+
     /// Factors on the learning rate at a step, in the order of `trains`.
     pub fn factors(&self, step: usize) -> impl Iterator<Item = f64> {
         let moves = move |group: &Group| self.freezes.get(group).is_none_or(|share| (step as f64) < share * self.steps as f64);
@@ -171,6 +190,11 @@ impl Stage {
             };
             require(*weight == 0.0 || there, key(&format!("minimizes.{}", loss.name())), format!("needs [losses.{}]", loss.name()))?;
         }
+        for (loss, every) in &self.every {
+            between(key(&format!("every.{}", loss.name())), *every, 1..=1_000_000)?;
+        }
+        let always = self.minimizes.iter().any(|(loss, weight)| *weight > 0.0 && self.every(*loss) == 1);
+        require(self.every.is_empty() || always, key("every"), "leaves steps at which nothing is minimized")?;
         for (group, factor) in &self.trains {
             let key = key(&format!("trains.{}", group.name()));
             between(&key, *factor, WEIGHTS)?;

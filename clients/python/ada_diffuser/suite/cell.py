@@ -26,6 +26,11 @@ class Places:
     #: Data sets that a suite collects.
     data: Path = Path("data")
 
+    @property
+    def stages(self) -> Path:
+        """First stages of trainings, which planners share that look for the same context."""
+        return self.runs / "stages"
+
 
 @dataclass(frozen=True)
 class Cell:

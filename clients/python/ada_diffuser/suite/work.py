@@ -116,12 +116,19 @@ def _trained(cell: Cell, places: Places, programs: Programs, data: Path) -> tupl
             save_json({"seconds": seconds, "finished": finished}, clock)
             return seconds
 
-        words = ["--seed", str(cell.seed), "--data", str(data), "--out", str(run)]
+        words = ["--seed", str(cell.seed), "--data", str(data), "--out", str(run), "--share-stages", str(places.stages)]
         words += [text for path in cell.method.changes for text in ("--with", str(path))]
         words += [text for key in cell.training_keys for text in ("--set", key)]
         _say(f"trains {run}")
         _run("ada-trainer run", [programs.trainer, "run", str(cell.recipe), *words], spent)
+        before["seconds"] += _shared_seconds(run)
         return run, spent(finished=True)
+
+
+def _shared_seconds(run: Path) -> float:
+    """What another training has spent on the stages that this one began behind."""
+    lines = map(json.loads, (run / "training/log.jsonl").read_text(encoding="utf-8").splitlines())
+    return sum(line.get("shared_seconds", 0.0) for line in lines)
 
 
 def _served(cell: Cell, programs: Programs, run: Path, model: Path) -> Path:
