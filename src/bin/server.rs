@@ -96,7 +96,7 @@ struct Flags {
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE", value_parser = key_value)]
     settings: Vec<(String, String)>,
     /// What is to go wrong, for tests: see docs/reliability.md.
-    #[arg(long = "fault", hide = true, value_name = "POINT=HARM[:MS][@N|@state=VALUE]")]
+    #[arg(long = "fault", hide = true, value_name = "POINT=HARM[:MS|:KB][@N|@state=VALUE]")]
     faults: Vec<Fault>,
 }
 

@@ -61,6 +61,23 @@ pub enum ServiceError {
     /// Open a session: this one gave its place to others.
     #[error("the session was evicted while idle to make room")]
     SessionEvicted,
+    /// Go on with the session as it is: what it was told since the token was made is not to be lost.
+    #[error(
+        "the token is of episode {episode}, step {step}; the session is in episode {running}, at step {committed}: attach to it instead"
+    )]
+    TokenStale {
+        /// Where the session stood when it was made.
+        step: u64,
+        /// Its episode then.
+        episode: u64,
+        /// Its episode now.
+        running: u64,
+        /// Where it stands now.
+        committed: u64,
+    },
+    /// Open a session: this token is too old.
+    #[error("the token has expired")]
+    TokenExpired,
     /// See the list of models.
     #[error("no model {model:?}; {instead}")]
     ModelNotFound {
@@ -269,6 +286,8 @@ impl ServiceError {
             Self::SessionNotFound => "SESSION_NOT_FOUND",
             Self::SessionExpired => "SESSION_EXPIRED",
             Self::SessionEvicted => "SESSION_EVICTED",
+            Self::TokenStale { .. } => "TOKEN_STALE",
+            Self::TokenExpired => "TOKEN_EXPIRED",
             Self::ModelNotFound { .. } => "MODEL_NOT_FOUND",
             Self::ModelGone { .. } => "MODEL_GONE",
             Self::TooLarge { .. } => "TOO_LARGE",
@@ -300,14 +319,18 @@ impl ServiceError {
             Self::StepOutOfOrder { committed, .. }
             | Self::SessionBusy { committed }
             | Self::StepPayloadMismatch { committed, .. }
-            | Self::EpisodeOver { committed, .. } => Some(*committed),
+            | Self::EpisodeOver { committed, .. }
+            | Self::TokenStale { committed, .. } => Some(*committed),
             _ => None,
         }
     }
 
     /// The episode that runs, for errors about episodes.
     pub fn episode(&self) -> Option<u64> {
-        if let Self::EpisodeOver { running, .. } = self { Some(*running) } else { None }
+        match self {
+            Self::EpisodeOver { running, .. } | Self::TokenStale { running, .. } => Some(*running),
+            _ => None,
+        }
     }
 
     /// When to try the same again, for errors that pass by themselves.
@@ -363,6 +386,8 @@ impl ServiceError {
             (Self::SessionNotFound, 5, 404, "SESSION_NOT_FOUND"),
             (Self::SessionExpired, 5, 410, "SESSION_EXPIRED"),
             (Self::SessionEvicted, 5, 410, "SESSION_EVICTED"),
+            (Self::TokenStale { step, episode: 1, running: 2, committed }, 10, 409, "TOKEN_STALE"),
+            (Self::TokenExpired, 9, 410, "TOKEN_EXPIRED"),
             (Self::ModelNotFound { model: "x".into(), instead: "there are: y".into() }, 5, 404, "MODEL_NOT_FOUND"),
             (Self::ModelGone { model: "x@0".into(), instead: "there are: y".into() }, 5, 410, "MODEL_GONE"),
             (Self::TooLarge { what: "bytes", limit: 1 }, 8, 413, "TOO_LARGE"),

@@ -1,5 +1,5 @@
 //! Harm on demand, so that what the server does about it can be shown: at a named point of an act's way the process is killed, the thread panics or
-//! hangs, or the network's output is not finite. `--fault POINT=HARM[:MS][@N|@state=VALUE]` arms one. Unarmed, a point costs one branch.
+//! hangs, the network's output is not finite, or memory is lost. `--fault POINT=HARM[:MS|:KB][@N|@state=VALUE]` arms one. Unarmed, a point costs one branch.
 
 use std::{str::FromStr, sync::Arc, sync::atomic::AtomicU64, sync::atomic::Ordering, thread, time::Duration};
 
@@ -29,6 +29,11 @@ pub enum Harm {
     Panic,
     /// The thread stands still for so long; None: for ever.
     Hang(Option<Duration>),
+    /// So much memory is taken and never given back.
+    Leak {
+        /// Thousands of bytes.
+        kb: usize,
+    },
     /// The act's numbers turn into NaN; at `Evaluating` alone.
     Nonfinite,
 }
@@ -44,7 +49,7 @@ enum Whom {
     State(f32),
 }
 
-/// One fault, as `POINT=HARM[:MS][@N|@state=VALUE]` says it.
+/// One fault, as `POINT=HARM[:MS|:KB][@N|@state=VALUE]` says it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fault {
     point: Point,
@@ -54,7 +59,7 @@ pub struct Fault {
 
 /// Why a text is none.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{what}; expected POINT=HARM[:MS][@N|@state=VALUE], e.g. evaluating=panic@state=7, computed=kill@100 or evaluating=hang:500@1")]
+#[error("{what}; expected POINT=HARM[:MS|:KB][@N|@state=VALUE], e.g. evaluating=panic@state=7, computed=kill@100 or evaluating=hang:500@1")]
 pub struct NoFault {
     what: String,
 }
@@ -66,9 +71,8 @@ impl FromStr for Fault {
         let wrong = |what: String| NoFault { what };
         let (point, rest) = text.split_once('=').ok_or_else(|| wrong("no harm is named".into()))?;
         let (harm, whom) = rest.split_once('@').map_or((rest, None), |(harm, whom)| (harm, Some(whom)));
-        let (harm, ms) = harm.split_once(':').map_or((harm, None), |(harm, ms)| (harm, Some(ms)));
-        let ms = ms.map(|ms| ms.parse().map(Duration::from_millis).map_err(|_| wrong(format!("{ms:?} is no number of milliseconds"))));
-        let (point, harm) = (point_of(point).map_err(wrong)?, harm_of(harm, ms.transpose()?).map_err(wrong)?);
+        let (harm, size) = harm.split_once(':').map_or((harm, None), |(harm, size)| (harm, Some(size)));
+        let (point, harm) = (point_of(point).map_err(wrong)?, harm_of(harm, size).map_err(wrong)?);
         let whom = whom.map_or(Ok(Whom::All), whom_of).map_err(wrong)?;
         if harm == Harm::Nonfinite && point != Point::Evaluating {
             return Err(wrong("nonfinite is for evaluating alone".into()));
@@ -92,14 +96,16 @@ fn point_of(word: &str) -> Result<Point, String> {
     }
 }
 
-fn harm_of(word: &str, time: Option<Duration>) -> Result<Harm, String> {
-    match (word, time) {
-        ("hang", time) => Ok(Harm::Hang(time)),
-        (_, Some(_)) => Err("only a hang takes a time".into()),
+fn harm_of(word: &str, size: Option<&str>) -> Result<Harm, String> {
+    let number = |of: &str| size.map(|size| size.parse::<u32>().map_err(|_| format!("{size:?} is no number of {of}"))).transpose();
+    match (word, size) {
+        ("hang", _) => Ok(Harm::Hang(number("milliseconds")?.map(|ms| Duration::from_millis(ms.into())))),
+        ("leak", _) => number("kilobytes")?.map(|kb| Harm::Leak { kb: kb as usize }).ok_or_else(|| "a leak takes its kilobytes".into()),
+        (_, Some(_)) => Err("only a hang takes a time, and a leak its kilobytes".into()),
         ("kill", None) => Ok(Harm::Kill),
         ("panic", None) => Ok(Harm::Panic),
         ("nonfinite", None) => Ok(Harm::Nonfinite),
-        _ => Err(format!("{word:?} is no harm; there are kill, panic, hang, nonfinite")),
+        _ => Err(format!("{word:?} is no harm; there are kill, panic, hang, leak, nonfinite")),
     }
 }
 
@@ -177,6 +183,8 @@ impl Harm {
             Self::Hang(None) => loop {
                 thread::park();
             },
+            // Written to, or the system would only promise it.
+            Self::Leak { kb } => std::mem::forget(vec![1_u8; kb * 1000]),
             Self::Nonfinite => {}
         }
     }
@@ -197,12 +205,15 @@ mod tests {
         assert_eq!(fault("evaluating=hang"), at(Point::Evaluating, Harm::Hang(None), Whom::All));
         assert_eq!(fault("told=hang:250@3"), at(Point::Told, Harm::Hang(Some(Duration::from_millis(250))), Whom::Nth(3)));
         assert_eq!(fault("evaluating=nonfinite@state=-1.5"), at(Point::Evaluating, Harm::Nonfinite, Whom::State(-1.5)));
+        assert_eq!(fault("told=leak:64"), at(Point::Told, Harm::Leak { kb: 64 }, Whom::All));
         assert_eq!(fault("draining=panic@1"), at(Point::Draining, Harm::Panic, Whom::Nth(1)));
         for (text, says) in [
             ("computed", "no harm"),
             ("nowhere=kill", "there are admitted"),
             ("stored=tickle", "there are kill"),
             ("stored=kill:5", "only a hang"),
+            ("stored=leak", "its kilobytes"),
+            ("stored=leak:much", "no number of kilobytes"),
             ("stored=hang:soon", "milliseconds"),
             ("stored=nonfinite", "evaluating alone"),
             ("stored=kill@0", "neither a number from 1"),

@@ -7,10 +7,13 @@ use crate::serve::{
     recording::Recorder,
     registry::Registry,
     session::{Handle, Kept, Opening, Renewal, Session, Sessions, Summary, Untold, name_of},
-    store::{Change, Durability, Embedded, Ending, Head, Options, Outcome, Place, Refused, Store, StoreError, UnixMs, Write, unix_ms},
+    store::{
+        Change, Durability, Embedded, Ending, Head, Options, Outcome, Place, Refused, Store, StoreError, UnixMs, Version, Write, unix_ms,
+    },
 };
 use parking_lot::Mutex;
 use std::{
+    cmp::Ordering,
     io,
     sync::Arc,
     time::{Duration, Instant},
@@ -120,6 +123,11 @@ impl Keeper {
         if self.expire(handle, bytes, &kept) {
             return Err(ServiceError::SessionExpired);
         }
+        self.take_in(kept, registry)
+    }
+
+    /// Into memory, as it was kept.
+    fn take_in(&self, kept: Kept, registry: &Registry) -> Result<Arc<Session>, ServiceError> {
         let Kept { id, request_id, opened, touched: _, record } = kept;
         let model = registry.pinned(&record.model, &record.model_digest)?.clone();
         let ttl = Duration::from_millis(record.ttl_ms);
@@ -158,6 +166,51 @@ impl Keeper {
             Err(error) => ServiceError::from_store(&error),
         };
         self.table.undo(&session);
+        Err(error)
+    }
+
+    /// The session that a token was made of, as the token has it, unless it is known here as it is there. It was ended or is damaged here, or is behind (a
+    /// server that lost its store, or to which the session comes back from another one): then the token is all there is of it.
+    ///
+    /// # Errors
+    /// `TokenStale` where more is known here, `ModelGone`, `Quota`, `StoreFull`, `StoreUnavailable`.
+    pub async fn resume(&self, kept: Kept, registry: &Registry) -> Result<Arc<Session>, ServiceError> {
+        let told = (kept.record.resets, kept.record.step);
+        let from = match self.find(kept.id, registry).await {
+            Ok(session) => {
+                let (_, standing) = session.standing((None, None))?;
+                let here = (standing.resets, standing.step);
+                match told.cmp(&here) {
+                    Ordering::Equal => return Ok(session),
+                    Ordering::Less => {
+                        let ((episode, step), (running, committed)) = (told, here);
+                        return Err(ServiceError::TokenStale { step, episode, running, committed });
+                    }
+                    Ordering::Greater => {}
+                }
+                self.table.let_go(&session);
+                Some(Version::at(&session.agent.spec().digest, here.0, here.1))
+            }
+            Err(ServiceError::StateCorrupt { .. }) => {
+                let change = Change::Free { from: None, ending: None, name: None };
+                let freed = self.keep(Write { handle: Handle::of(kept.id), change }, |_| ()).await;
+                freed.map_err(|error| ServiceError::from_store(&error)).map(|_freed| None)?
+            }
+            Err(ServiceError::SessionNotFound | ServiceError::SessionExpired | ServiceError::SessionEvicted) => None,
+            Err(error) => return Err(error),
+        };
+        let write = kept_anew(&kept, from)?;
+        let session = self.take_in(kept, registry)?;
+        if from.is_none() {
+            metrics::counter!("ada_sessions_created_total").increment(1);
+        }
+        let error = match self.keep(write, |_| ()).await {
+            Ok(Ok(())) => return Ok(session),
+            Ok(Err(refused)) => ServiceError::from_refused(refused),
+            Err(error) => ServiceError::from_store(&error),
+        };
+        // What is kept is what holds: whoever asks again is told by it.
+        self.table.let_go(&session);
         Err(error)
     }
 
@@ -326,6 +379,13 @@ impl Keeper {
             let _forgotten = store.home().forget_endings(before);
         }
     }
+}
+
+/// What takes the place of what is there.
+fn kept_anew(kept: &Kept, from: Option<Version>) -> Result<Write, ServiceError> {
+    let bytes = Kept { touched: unix_ms(), ..kept.clone() }.write().map_err(|error| ServiceError::internal(&error))?;
+    let name = name_of(&kept.request_id).filter(|_| from.is_none());
+    Ok(Write { handle: Handle::of(kept.id), change: Change::Keep { from, bytes, name } })
 }
 
 fn start(config: &StoreConfig) -> Result<Store, KeeperError> {

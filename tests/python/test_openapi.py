@@ -83,6 +83,8 @@ def test_answers_fit_their_schemas(address: str, spec: dict[str, Any]) -> None:
     record = ask("GET", f"{session}/export", path=f"/v1/sessions/{name}/export")
     assert ask("POST", "/v1/sessions:import", record)["session"]["episode"] == 1
     assert ask("POST", "/v1/sessions:import", {"record": ""})["field"] == "record"
+    assert "tokens.key_file" in ask("POST", f"{session}/seal", path=f"/v1/sessions/{name}/seal")["detail"]
+    assert ask("POST", "/v1/sessions:resume", {"token": ""})["field"] == "token"
     assert ask("POST", f"{session}/fork", {"seed": 2}, path=f"/v1/sessions/{name}/fork")["session"]["seed"] == 2
     assert len(ask("GET", "/v1/sessions", path="/v1/sessions?page_size=1&model=tiny")["sessions"]) == 1
     assert ask("GET", "/v1/models")["models"]

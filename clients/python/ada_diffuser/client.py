@@ -159,6 +159,19 @@ class Client:
         summary, spec = self._tried(lambda timeout_s: self._face.import_session(record, ttl_ms, request_id, timeout_s))
         return Session(self, summary, spec)
 
+    def resume(self, token: bytes) -> Session:
+        """The session that a token was made of (`Session.token`), with its id, where it stood then: on any server that has the key.
+
+        Where this server knows the session as it is in the token, or nothing of it, or something older, it goes on from there. `TokenStale`
+        where it knows more: then `attach` to it, for acts that were committed are not taken back. The chunk of the last act is given again to
+        whoever asks for it: `committed_step` is the session's, so an act that was sent after the token was made is sent again, as it was.
+        """
+        if not isinstance(token, (bytes, bytearray, memoryview)):
+            raise invalid("token", f"is no bytes, but a {type(token).__name__}")
+        token = bytes(token)
+        summary, spec = self._tried(lambda timeout_s: self._face.resume_session(token, timeout_s))
+        return Session(self, summary, spec)
+
     def attach(self, session_id: str, *, committed_step: int | None = None) -> Session:
         """A session that was opened elsewhere, or before this program was started again. It goes on from where it stands on the server.
 
@@ -280,6 +293,9 @@ class Client:
 
     def _export(self, session_id: str) -> bytes:
         return self._tried(lambda timeout_s: self._face.export_session(session_id, timeout_s))
+
+    def _seal(self, session_id: str) -> bytes:
+        return self._tried(lambda timeout_s: self._face.seal_session(session_id, timeout_s))
 
     def _fork(self, call: ForkCall) -> Session:
         summary, spec = self._tried(lambda timeout_s: self._face.fork_session(call, timeout_s))

@@ -106,6 +106,16 @@ class StepConflict(AdaError):
     """Somebody else moved the session: go on by `session.catch_up()`. STEP_OUT_OF_ORDER, SESSION_BUSY, EPISODE_OVER."""
 
 
+class TokenStale(StepConflict):
+    """The session has gone on since the token was made: `client.attach(session_id)`. TOKEN_STALE."""
+
+
+class TokenExpired(SessionGone):
+    """The token is too old to go on from: open a new session. TOKEN_EXPIRED."""
+
+    cure = "open a new session, or go on from a newer token of this one (client.resume)"
+
+
 class PayloadMismatch(AdaError):
     """This step was taken with another observation, its answer was lost. STEP_PAYLOAD_MISMATCH."""
 
@@ -166,6 +176,8 @@ _BY_REASON: dict[str, type[AdaError]] = {
     "SESSION_EXPIRED": SessionGone,
     "SESSION_EVICTED": SessionGone,
     "STATE_CORRUPT": StateCorrupt,
+    "TOKEN_STALE": TokenStale,
+    "TOKEN_EXPIRED": TokenExpired,
     "STEP_OUT_OF_ORDER": StepConflict,
     "SESSION_BUSY": StepConflict,
     "EPISODE_OVER": StepConflict,

@@ -5,10 +5,12 @@ mod record;
 mod store;
 #[cfg(test)]
 mod tests;
+mod tokens;
 
 pub use layers::Origin;
 pub use record::RecordConfig;
 pub use store::StoreConfig;
+pub use tokens::TokensConfig;
 
 use crate::{model::nn::Precision, serve::fault::Faults};
 use layers::Layers;
@@ -29,6 +31,8 @@ pub struct Config {
     pub sessions: SessionsConfig,
     /// Where sessions outlive the process.
     pub store: StoreConfig,
+    /// Sealed resume tokens.
+    pub tokens: TokensConfig,
     /// Recordings of acts.
     pub record: RecordConfig,
     /// The threads that run the networks.
@@ -410,7 +414,7 @@ impl Config {
     }
 
     /// Settings that make no sense as 0.
-    fn positive(&self) -> [(&'static str, u64); 37] {
+    fn positive(&self) -> [(&'static str, u64); 38] {
         let (connection, limits, sessions, store, engine) = (&self.connection, &self.limits, &self.sessions, &self.store, &self.engine);
         [
             ("server.connections_max", self.server.connections_max as u64),
@@ -441,6 +445,7 @@ impl Config {
             ("store.cache_bytes", store.cache_bytes as u64),
             ("store.queue_len_max", store.queue_len_max as u64),
             ("store.sweep_len", store.sweep_len as u64),
+            ("tokens.ttl_ms", self.tokens.ttl_ms),
             ("record.file_bytes_max", self.record.file_bytes_max),
             ("record.queue_len_max", self.record.queue_len_max as u64),
             ("record.queue_bytes_max", self.record.queue_bytes_max as u64),

@@ -149,6 +149,16 @@ impl agent_server::Agent for Face {
         opened(self.0.fork(convert::fork_request(request.into_inner())).await)
     }
 
+    async fn seal_session(&self, request: Request<pb::SealSessionRequest>) -> Answer<pb::SealSessionResponse> {
+        let pb::SealSessionRequest { session_id } = request.into_inner();
+        let (token, expires_in_ms) = self.0.seal(&session_id).await.map_err(refuse)?;
+        Ok(Response::new(pb::SealSessionResponse { token, expires_in_ms }))
+    }
+
+    async fn resume_session(&self, request: Request<pb::ResumeSessionRequest>) -> Answer<pb::OpenSessionResponse> {
+        opened(self.0.resume(&request.into_inner().token).await)
+    }
+
     async fn act(&self, request: Request<pb::ActRequest>) -> Answer<pb::ActResponse> {
         let (timeout, client) = (timeout(request.metadata()), client(&request));
         let result = match convert::act_request(request.into_inner(), timeout, client) {

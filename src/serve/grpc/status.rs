@@ -10,8 +10,11 @@ use tonic::{
 pub fn code(error: &ServiceError) -> Code {
     match error {
         ServiceError::Invalid { .. } => Code::InvalidArgument,
-        ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } | ServiceError::EpisodeOver { .. } => Code::Aborted,
-        ServiceError::StepPayloadMismatch { .. } | ServiceError::PoisonStep { .. } => Code::FailedPrecondition,
+        ServiceError::StepOutOfOrder { .. }
+        | ServiceError::SessionBusy { .. }
+        | ServiceError::EpisodeOver { .. }
+        | ServiceError::TokenStale { .. } => Code::Aborted,
+        ServiceError::StepPayloadMismatch { .. } | ServiceError::PoisonStep { .. } | ServiceError::TokenExpired => Code::FailedPrecondition,
         ServiceError::SessionNotFound
         | ServiceError::SessionExpired
         | ServiceError::SessionEvicted

@@ -67,6 +67,24 @@ impl ExportAnswer {
     }
 }
 
+/// Answer of SealSession.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct SealAnswer {
+    /// In base64.
+    #[schema(format = "byte")]
+    token: String,
+    /// For so long it can be resumed from.
+    #[schema(format = "uint64")]
+    expires_in_ms: u64,
+}
+
+impl SealAnswer {
+    /// Of the token's bytes, and how long it holds.
+    pub fn of((token, expires_in_ms): (Vec<u8>, u64)) -> Self {
+        Self { token: BASE64_STANDARD.encode(token), expires_in_ms }
+    }
+}
+
 /// Where the time went.
 #[derive(Debug, Serialize, ToSchema)]
 struct TimingsAnswer {

@@ -138,6 +138,25 @@ impl TryFrom<ImportBody> for ImportRequest {
     }
 }
 
+/// ResumeSession.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ResumeBody {
+    /// From SealSession.
+    #[schema(format = "byte")]
+    token: String,
+}
+
+impl ResumeBody {
+    /// The token's bytes.
+    ///
+    /// # Errors
+    /// If it is no base64.
+    pub fn into_token(self) -> Result<Vec<u8>, ServiceError> {
+        BASE64_STANDARD.decode(self.token).map_err(|error| ServiceError::invalid("token", format!("is no base64: {error}")))
+    }
+}
+
 /// ForkSession.
 #[derive(Debug, Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]

@@ -48,10 +48,15 @@ pub struct Problem {
 pub fn status(error: &ServiceError) -> StatusCode {
     match error {
         ServiceError::Invalid { .. } => StatusCode::BAD_REQUEST,
-        ServiceError::StepOutOfOrder { .. } | ServiceError::SessionBusy { .. } | ServiceError::EpisodeOver { .. } => StatusCode::CONFLICT,
+        ServiceError::StepOutOfOrder { .. }
+        | ServiceError::SessionBusy { .. }
+        | ServiceError::EpisodeOver { .. }
+        | ServiceError::TokenStale { .. } => StatusCode::CONFLICT,
         ServiceError::StepPayloadMismatch { .. } | ServiceError::PoisonStep { .. } => StatusCode::UNPROCESSABLE_ENTITY,
         ServiceError::SessionNotFound | ServiceError::ModelNotFound { .. } => StatusCode::NOT_FOUND,
-        ServiceError::SessionExpired | ServiceError::SessionEvicted | ServiceError::ModelGone { .. } => StatusCode::GONE,
+        ServiceError::SessionExpired | ServiceError::SessionEvicted | ServiceError::TokenExpired | ServiceError::ModelGone { .. } => {
+            StatusCode::GONE
+        }
         ServiceError::TooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
         ServiceError::QueueFull { .. } | ServiceError::Quota { .. } => StatusCode::TOO_MANY_REQUESTS,
         ServiceError::Deadline { .. } => StatusCode::GATEWAY_TIMEOUT,

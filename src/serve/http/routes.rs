@@ -2,9 +2,9 @@
 
 use super::{
     Gate, State,
-    answer::{ActAnswer, BatchAnswer, ExportAnswer, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer},
+    answer::{ActAnswer, BatchAnswer, ExportAnswer, ManyModels, ManySessions, OneModel, OneSession, OpenAnswer, SealAnswer},
     body::{bytes, parse, unfitting},
-    json::{ActBody, BatchBody, ForkBody, ImportBody, ListQuery, OpenBody, ResetBody, View},
+    json::{ActBody, BatchBody, ForkBody, ImportBody, ListQuery, OpenBody, ResetBody, ResumeBody, View},
     problem::Problem,
     stream,
 };
@@ -53,6 +53,8 @@ fn documented() -> OpenApiRouter<State> {
         .routes(routes!(export_session))
         .routes(routes!(import_session))
         .routes(routes!(fork_session))
+        .routes(routes!(seal_session))
+        .routes(routes!(resume_session))
         .routes(routes!(act))
         .routes(routes!(act_stream))
         .routes(routes!(act_batch))
@@ -164,6 +166,20 @@ async fn export_session(Shared(state): Shared<State>, Named(id): Named) -> Answe
 async fn import_session(Shared(state): Shared<State>, body: Body) -> Result<Response, Problem> {
     let request: ImportBody = read(body, &state).await?;
     Ok(opened(state.service.import(request.try_into()?).await?))
+}
+
+/// SealSession
+#[utoipa::path(post, path = "/v1/sessions/{id}/seal", params(("id" = String, Path)),
+    responses((status = 200, description = "A token to resume it from, and for how long", body = SealAnswer), Problem))]
+async fn seal_session(Shared(state): Shared<State>, Named(id): Named) -> Answer<SealAnswer> {
+    Ok(Json(SealAnswer::of(state.service.seal(&id).await?)))
+}
+
+/// ResumeSession
+#[utoipa::path(post, path = "/v1/sessions:resume", request_body = ResumeBody, responses((status = 201, description = "The session, and its model", body = OpenAnswer), Problem))]
+async fn resume_session(Shared(state): Shared<State>, body: Body) -> Result<Response, Problem> {
+    let body: ResumeBody = read(body, &state).await?;
+    Ok(opened(state.service.resume(&body.into_token()?).await?))
 }
 
 /// ForkSession

@@ -12,7 +12,7 @@ use crate::serve::{
     recording::{RecordError, Writer},
     registry::{Model, Registry, RegistryError},
     seat::{RETRY_AFTER_LOADING_MS, RETRY_AFTER_RESTART_MS, Seat},
-    session::Session,
+    session::{KeyError, Sealer, Session},
     telemetry,
 };
 use std::{
@@ -34,6 +34,9 @@ pub enum StartError {
     /// No place for recordings.
     #[error(transparent)]
     Record(#[from] RecordError),
+    /// No keys where there should be some.
+    #[error(transparent)]
+    Keys(#[from] KeyError),
 }
 
 /// The service: models, sessions and the engine between them.
@@ -43,6 +46,8 @@ pub struct Service {
     keeper: Keeper,
     engine: Engine<Seat>,
     recording: Option<Writer>,
+    /// Of resume tokens, where there is a key.
+    sealer: Option<Sealer>,
     draining: CancellationToken,
 }
 
@@ -50,12 +55,14 @@ impl Service {
     /// A service without models; see [`Service::set_registry`].
     ///
     /// # Errors
-    /// If the system gives no threads for the engine, or the store cannot be opened, or nothing can be recorded where it should be.
+    /// If the system gives no threads for the engine, or the store cannot be opened, nothing can be recorded where it should be, or the keys of tokens
+    /// cannot be read.
     pub fn start(config: Config) -> Result<Self, StartError> {
         let recording = Writer::start(&config.record, config.models.weights)?;
         let keeper = Keeper::open_store(&config.sessions, &config.store)?.recorded_by(recording.as_ref().map(Writer::recorder));
+        let sealer = Sealer::of(&config.tokens)?;
         let engine = Engine::start(engine_options(&config.engine), config.faults.clone()).map_err(StartError::Engine)?;
-        Ok(Self { config, registry: OnceLock::new(), keeper, engine, recording, draining: CancellationToken::new() })
+        Ok(Self { config, registry: OnceLock::new(), keeper, engine, recording, sealer, draining: CancellationToken::new() })
     }
 
     /// Runs each model in every batch length, so that its first act is as fast as any. Blocks for that time. Gives the models back that can

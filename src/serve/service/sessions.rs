@@ -7,7 +7,8 @@ use crate::{
         error::ServiceError,
         registry::Model,
         request::{ForkRequest, ImportRequest, ListRequest, OpenRequest, Opened, Page, ResetRequest},
-        session::{Handle, Opening, Record, Renewal, Standing, Summary, is_request_id},
+        session::{Handle, Opening, Record, Renewal, Sealed, Standing, Summary, is_request_id},
+        store::unix_ms,
     },
 };
 use std::{
@@ -79,6 +80,33 @@ impl Service {
         self.begin(model, (Arc::new(forked.with_seed(seed.unwrap_or(own))), standing), ttl, request_id).await
     }
 
+    /// SealSession: what is committed at this moment, for [`Service::resume`] here or elsewhere, and how long that holds, in milliseconds.
+    ///
+    /// # Errors
+    /// `SessionNotFound` and its kin, `Invalid` where there is no key. It goes on while the server drains.
+    pub async fn seal(&self, session_id: &str) -> Result<(Vec<u8>, u64), ServiceError> {
+        let sealer = self.sealer.as_ref().ok_or_else(|| no_key("session_id"))?;
+        let kept = self.session(session_id).await?.as_kept()?.write().map_err(|error| ServiceError::internal(&error))?;
+        Ok(sealer.seal(&kept, unix_ms()))
+    }
+
+    /// ResumeSession: the session itself, unless it has gone on since.
+    ///
+    /// # Errors
+    /// `Invalid`, `TokenExpired`, `TokenStale`, `ModelGone`, and those of [`Service::open`].
+    pub async fn resume(&self, token: &[u8]) -> Result<Opened, ServiceError> {
+        let sealer = self.sealer.as_ref().ok_or_else(|| no_key("token"))?;
+        let registry = self.registry()?;
+        let kept = sealer.open(token, unix_ms()).map_err(|error| match error {
+            Sealed::Expired => ServiceError::TokenExpired,
+            error @ (Sealed::Foreign | Sealed::Newer(_) | Sealed::Unreadable(_)) => ServiceError::invalid("token", error.to_string()),
+        })?;
+        let model = registry.pinned(&kept.record.model, &kept.record.model_digest)?.clone();
+        let session = self.keeper.resume(kept, registry).await?;
+        // Its client knows its id: it is not undone when it hears nothing.
+        Ok(Opened { session: session.summary(Instant::now()), model, untold: None })
+    }
+
     /// A session that goes on from here.
     async fn begin(
         &self,
@@ -144,6 +172,10 @@ impl Service {
         }
         Ok(Duration::from_millis(ttl_ms))
     }
+}
+
+fn no_key(field: &str) -> ServiceError {
+    ServiceError::invalid(field, "this server has no key to seal sessions with: tokens.key_file is not set")
 }
 
 fn check_request_id(id: &str) -> Result<(), ServiceError> {

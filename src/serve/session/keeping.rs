@@ -68,12 +68,23 @@ impl Session {
         }
     }
 
+    /// What is kept of it where it stands at this moment.
+    ///
+    /// # Errors
+    /// If it has ended.
+    pub fn as_kept(&self) -> Result<Kept, ServiceError> {
+        Record::of(self).map(|record| self.kept(record))
+    }
+
+    fn kept(&self, record: Record) -> Kept {
+        Kept { id: self.id, request_id: self.request_id.clone(), opened: self.opened, touched: unix_ms(), record }
+    }
+
     fn write(&self, from: Option<Version>, standing: Standing, episode: Arc<Episode>) -> Result<Write, ServiceError> {
         let Standing { step, resets, reset_ids, last } = standing;
         let (model, model_digest) = (self.model.to_string(), self.agent.spec().digest.clone());
         let record = Record { model, model_digest, ttl_ms: self.ttl.as_millis() as u64, step, resets, reset_ids, episode, last };
-        let kept = Kept { id: self.id, request_id: self.request_id.clone(), opened: self.opened, touched: unix_ms(), record };
-        let bytes = kept.write().map_err(|error| ServiceError::internal(&error))?;
+        let bytes = self.kept(record).write().map_err(|error| ServiceError::internal(&error))?;
         let name = name_of(&self.request_id).filter(|_| from.is_none());
         Ok(Write { handle: self.handle, change: Change::Keep { from, bytes, name } })
     }

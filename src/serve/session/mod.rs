@@ -10,6 +10,7 @@ mod reset;
 mod summary;
 mod table;
 mod taping;
+mod token;
 mod untold;
 
 pub use flight::{Flight, Waiter};
@@ -21,6 +22,7 @@ pub use reset::{Renewal, Reset};
 pub use summary::{Detail, Summary};
 pub use table::Sessions;
 pub use taping::Taken;
+pub use token::{KeyError, Sealed, Sealer};
 pub use untold::Untold;
 
 use crate::{

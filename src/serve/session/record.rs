@@ -167,7 +167,8 @@ impl Kept {
         if Head::of(bytes) == Some(kept.head()) { Ok(kept) } else { Err(Unreadable::Damaged) }
     }
 
-    fn head(&self) -> Head {
+    /// What stands before it in a store.
+    pub fn head(&self) -> Head {
         let Record { model_digest, ttl_ms, step, resets, .. } = &self.record;
         Head { version: Version::at(model_digest, *resets, *step), touched: self.touched, ttl_ms: *ttl_ms }
     }

@@ -230,6 +230,14 @@ impl Sessions {
         }
     }
 
+    /// Lets a session go, in whose place another state of it comes: an act in flight is dropped.
+    pub fn let_go(&self, session: &Session) {
+        if self.shard(session.handle).lock().live.remove(&session.handle).is_some() {
+            self.forget(session);
+            session.end();
+        }
+    }
+
     /// One that is in memory, as it is.
     pub fn live(&self, handle: Handle) -> Option<Arc<Session>> {
         self.shard(handle).lock().live.get(&handle).filter(|session| !session.is_over()).cloned()

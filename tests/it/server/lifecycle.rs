@@ -149,8 +149,10 @@ async fn the_faces_describe_themselves() {
         "/v1/sessions/{id}/export",
         "/v1/sessions/{id}/fork",
         "/v1/sessions/{id}/reset",
+        "/v1/sessions/{id}/seal",
         "/v1/sessions/{id}/stream",
         "/v1/sessions:import",
+        "/v1/sessions:resume",
     ];
     assert_eq!(paths, expected);
     assert!(api["components"]["schemas"]["ActBody"]["properties"]["observation"].is_object());

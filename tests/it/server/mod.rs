@@ -21,6 +21,7 @@ mod records;
 mod steps;
 mod store;
 mod streams;
+mod tokens;
 
 use ada_diffuser::{
     model::{checkpoint, config::ModelConfig},

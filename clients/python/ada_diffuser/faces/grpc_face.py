@@ -89,6 +89,13 @@ class GrpcFace:
         request = agent_pb2.ImportSessionRequest(record=record, ttl_ms=ttl_ms, request_id=request_id)
         return _opened(self._call(self._agent.ImportSession, request, timeout_s))
 
+    def seal_session(self, session_id: str, timeout_s: float) -> bytes:
+        token: bytes = self._call(self._agent.SealSession, agent_pb2.SealSessionRequest(session_id=session_id), timeout_s).token
+        return token
+
+    def resume_session(self, token: bytes, timeout_s: float) -> tuple[SessionSummary, Model]:
+        return _opened(self._call(self._agent.ResumeSession, agent_pb2.ResumeSessionRequest(token=token), timeout_s))
+
     def fork_session(self, call: ForkCall, timeout_s: float) -> tuple[SessionSummary, Model]:
         request = agent_pb2.ForkSessionRequest(
             session_id=call.session_id,

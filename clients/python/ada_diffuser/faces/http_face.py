@@ -59,6 +59,13 @@ class HttpFace:
         body = http_json.without_none(record=http_json.binary_out(record), ttl_ms=ttl_ms, request_id=request_id)
         return _opened(self._call("POST", "/v1/sessions:import", body, timeout_s))
 
+    def seal_session(self, session_id: str, timeout_s: float) -> bytes:
+        answer = self._call("POST", f"/v1/sessions/{_quoted(session_id)}/seal", None, timeout_s)
+        return http_json.read(http_json.binary, answer, "token")
+
+    def resume_session(self, token: bytes, timeout_s: float) -> tuple[SessionSummary, Model]:
+        return _opened(self._call("POST", "/v1/sessions:resume", {"token": http_json.binary_out(token)}, timeout_s))
+
     def fork_session(self, call: ForkCall, timeout_s: float) -> tuple[SessionSummary, Model]:
         body = http_json.without_none(seed=call.seed, ttl_ms=call.ttl_ms, request_id=call.request_id, step=call.step, episode=call.episode)
         return _opened(self._call("POST", f"/v1/sessions/{_quoted(call.session_id)}/fork", body, timeout_s))

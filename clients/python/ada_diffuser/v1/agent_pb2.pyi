@@ -304,6 +304,26 @@ class ImportSessionRequest(_message.Message):
     request_id: str
     def __init__(self, record: _Optional[bytes] = ..., ttl_ms: _Optional[int] = ..., request_id: _Optional[str] = ...) -> None: ...
 
+class SealSessionRequest(_message.Message):
+    __slots__ = ("session_id",)
+    SESSION_ID_FIELD_NUMBER: _ClassVar[int]
+    session_id: str
+    def __init__(self, session_id: _Optional[str] = ...) -> None: ...
+
+class SealSessionResponse(_message.Message):
+    __slots__ = ("token", "expires_in_ms")
+    TOKEN_FIELD_NUMBER: _ClassVar[int]
+    EXPIRES_IN_MS_FIELD_NUMBER: _ClassVar[int]
+    token: bytes
+    expires_in_ms: int
+    def __init__(self, token: _Optional[bytes] = ..., expires_in_ms: _Optional[int] = ...) -> None: ...
+
+class ResumeSessionRequest(_message.Message):
+    __slots__ = ("token",)
+    TOKEN_FIELD_NUMBER: _ClassVar[int]
+    token: bytes
+    def __init__(self, token: _Optional[bytes] = ...) -> None: ...
+
 class ForkSessionRequest(_message.Message):
     __slots__ = ("session_id", "seed", "ttl_ms", "request_id", "step", "episode")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]

@@ -101,6 +101,16 @@ class AgentStub(object):
                 request_serializer=ada__diffuser_dot_v1_dot_agent__pb2.ForkSessionRequest.SerializeToString,
                 response_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.FromString,
                 _registered_method=True)
+        self.SealSession = channel.unary_unary(
+                '/ada_diffuser.v1.Agent/SealSession',
+                request_serializer=ada__diffuser_dot_v1_dot_agent__pb2.SealSessionRequest.SerializeToString,
+                response_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.SealSessionResponse.FromString,
+                _registered_method=True)
+        self.ResumeSession = channel.unary_unary(
+                '/ada_diffuser.v1.Agent/ResumeSession',
+                request_serializer=ada__diffuser_dot_v1_dot_agent__pb2.ResumeSessionRequest.SerializeToString,
+                response_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.FromString,
+                _registered_method=True)
 
 
 class AgentServicer(object):
@@ -197,6 +207,22 @@ class AgentServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def SealSession(self, request, context):
+        """The session as a token that its client keeps, and can neither read nor change: to resume it after a crash, on this server or another one that has the
+        key, with no store. INVALID_ARGUMENT where the server has no key.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ResumeSession(self, request, context):
+        """The same session, with the same id, as the token has it, where the server knows nothing of it, or something older. Where it knows the same it is as it
+        is; where it knows something newer, ABORTED (TOKEN_STALE), with where that stands.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_AgentServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -253,6 +279,16 @@ def add_AgentServicer_to_server(servicer, server):
             'ForkSession': grpc.unary_unary_rpc_method_handler(
                     servicer.ForkSession,
                     request_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.ForkSessionRequest.FromString,
+                    response_serializer=ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.SerializeToString,
+            ),
+            'SealSession': grpc.unary_unary_rpc_method_handler(
+                    servicer.SealSession,
+                    request_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.SealSessionRequest.FromString,
+                    response_serializer=ada__diffuser_dot_v1_dot_agent__pb2.SealSessionResponse.SerializeToString,
+            ),
+            'ResumeSession': grpc.unary_unary_rpc_method_handler(
+                    servicer.ResumeSession,
+                    request_deserializer=ada__diffuser_dot_v1_dot_agent__pb2.ResumeSessionRequest.FromString,
                     response_serializer=ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.SerializeToString,
             ),
     }
@@ -564,6 +600,60 @@ class Agent(object):
             target,
             '/ada_diffuser.v1.Agent/ForkSession',
             ada__diffuser_dot_v1_dot_agent__pb2.ForkSessionRequest.SerializeToString,
+            ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def SealSession(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ada_diffuser.v1.Agent/SealSession',
+            ada__diffuser_dot_v1_dot_agent__pb2.SealSessionRequest.SerializeToString,
+            ada__diffuser_dot_v1_dot_agent__pb2.SealSessionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ResumeSession(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ada_diffuser.v1.Agent/ResumeSession',
+            ada__diffuser_dot_v1_dot_agent__pb2.ResumeSessionRequest.SerializeToString,
             ada__diffuser_dot_v1_dot_agent__pb2.OpenSessionResponse.FromString,
             options,
             channel_credentials,
