@@ -57,7 +57,11 @@ chaos: ## Kills servers while sessions act, and looks for acts that are lost or 
 	cargo build $(CARGO_FLAGS) --bins --example chaos
 	target/release/examples/chaos --kills $(KILLS) --durability $(DURABILITY)
 
-.PHONY: chaos reliability-tools
+MINUTES ?= 120
+soak: build venv ## Hours of mixed work on one server, whose memory has to stay and whose counters have to add up: make soak MINUTES=120
+	$(BIN)/python -m tests.soak --minutes $(MINUTES)
+
+.PHONY: chaos soak reliability-tools
 reliability-tools: .venv-reliability/.ready
 .venv-reliability/.ready: tests/reliability/requirements.txt | tools
 	$(PYTHON) -m venv .venv-reliability

@@ -23,6 +23,7 @@ SCENARIOS: dict[str, Callable[[], Iterator[Row]]] = {
     "recording": recording.measure,
     "speed": speed.measure,
     "store": store.measure,
+    "million": store.measure_million,
 }
 
 
@@ -34,12 +35,12 @@ def main() -> int:
         epilog=f"scenarios:\n{listed}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="which of them (default: all but speed)")
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="which of them (default: all but speed and million)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="keeps the rows of these scenarios in FILE, in the place of older ones")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of every server, e.g. a lax one")
     flags = parser.parse_args()
     EXTRA.extend(flags.set)
-    chosen = flags.scenarios or [name for name in SCENARIOS if name != "speed"]
+    chosen = flags.scenarios or [name for name in SCENARIOS if name not in ("speed", "million")]
     for name in chosen:
         if name not in SCENARIOS:
             parser.error(f"no scenario {name}: there are {', '.join(SCENARIOS)}")

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -59,9 +59,10 @@ class Server:
         log: int | IO[str] = subprocess.DEVNULL,
         cores: Iterable[int] = (),
         program: Path = RELEASE / "ada-server",
+        flags: Sequence[str] = (),
     ) -> None:
         address = f"127.0.0.1:{_free_port()}"
-        command = [*on_cores(cores), str(program), "--models", str(models), "--listen", address]
+        command = [*on_cores(cores), str(program), "--models", str(models), "--listen", address, *flags]
         for setting in ("telemetry.format=json", *settings, *EXTRA):
             command += ["--set", setting]
         open_files_max()

@@ -18,7 +18,7 @@ import numpy as np
 
 from ada_diffuser import Client
 
-from .process import RELEASE, ROOT, Row, Server, load, report
+from .process import MB, RELEASE, ROOT, Row, Server, load, report
 
 LEVELS = ("memory", "process", "power")
 TURNS, SECONDS, CLIENTS = 9, 1.5, 32
@@ -27,6 +27,7 @@ STORED = 100_000
 #: Of them, those whose first act after it is timed.
 COLD = 200
 RESIDENT = 20_000
+MILLION = 1_000_000
 GIB = float(1 << 30)
 #: Longest time until so many are stored.
 PATIENCE_S = 1800.0
@@ -95,11 +96,32 @@ def _back() -> Iterator[Row]:
             for session in sessions:
                 for kind, step in ((cold, 2), (hot, 3)):
                     begin = time.monotonic()
-                    _act(connection, session.id, step)
+                    _act(connection, session.session_id, step)
                     kind.append(time.monotonic() - begin)
         beyond = [(a - b) * 1e3 for a, b in zip(cold, hot, strict=True)]
         yield Row("store", "first act of a cold session beyond a hot one: median", statistics.median(beyond), 10, "ms")
         yield Row("store", "the same: the 99th of a hundred", float(np.percentile(beyond, 99)), 10, "ms")
+
+
+def measure_million() -> Iterator[Row]:
+    """A million sessions, each with an act."""
+    with models("tiny") as directory, tempfile.TemporaryDirectory(dir=ROOT / "target") as store:
+        settings = ("models.default=tiny", f"store.dir={store}", "sessions.ttl_ms=86400000", f"store.len_max={2 * MILLION}")
+        state = np.zeros(4, np.float32)
+        with Server(*settings, models=directory) as server, Client(server.url) as client:
+            session = client.open_session("tiny")
+            session.act(state)
+            fill(server, MILLION)
+            yield Row("million", "memory of the server with as many stored", server.memory() / MB, 1_000, "MB")
+            yield Row("million", "bytes of the file for each", server.metric("ada_store_medium_bytes") / MILLION, 65_536 / 5, "B")
+            server.process.kill()
+        begin = time.monotonic()
+        with Server(*settings, models=directory) as server:
+            yield Row("million", "ready after a kill", time.monotonic() - begin, 20, "s")
+            yield Row("million", "stored", server.metric("ada_store_sessions"), MILLION, "", at_least=True)
+            begin = time.monotonic()
+            _act(HTTPConnection(server.address), session.session_id, 2)
+            yield Row("million", "first act of one of them", (time.monotonic() - begin) * 1e3, 50, "ms")
 
 
 def _ready(directory: Path, settings: tuple[str, ...]) -> float:
