@@ -162,9 +162,9 @@ class Client:
     def resume(self, token: bytes) -> Session:
         """The session that a token was made of (`Session.token`), with its id, where it stood then: on any server that has the key.
 
-        Where this server knows the session as it is in the token, or nothing of it, or something older, it goes on from there. `TokenStale`
-        where it knows more: then `attach` to it, for acts that were committed are not taken back. The chunk of the last act is given again to
-        whoever asks for it: `committed_step` is the session's, so an act that was sent after the token was made is sent again, as it was.
+        Where this server knows nothing of the session, or something older, it goes on from the token; where it knows the same, as it is.
+        `TokenStale` where it knows more: then `attach`, for acts that were committed are not taken back. An act that was answered after
+        the token was made is asked for again, and gets the same answer if it is told the same.
         """
         if not isinstance(token, (bytes, bytearray, memoryview)):
             raise invalid("token", f"is no bytes, but a {type(token).__name__}")
