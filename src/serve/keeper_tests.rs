@@ -77,6 +77,12 @@ async fn memory_that_is_behind_is_found_out() {
     assert_eq!(keeper.keep(kept.clone(), |_| ()).await, Ok(Ok(())), "nobody told the session");
     assert_eq!(keeper.keep(next(&session), |_| ()).await, Ok(Err(Refused::Conflict)));
     session.overtaken(Refused::Conflict);
+    // Whoever found it before that is not told that there is none.
+    let late = [
+        session.standing((None, None)).err(),
+        session.begin_reset(Renewal { seed: 1, keep_history: false }, None, String::new(), Instant::now()).err(),
+    ];
+    assert_eq!(late.map(|error| error.unwrap().reason()), ["STORE_UNAVAILABLE"; 2]);
     let again = keeper.find(session.id, &registry).await.unwrap();
     assert_eq!(again.summary(Instant::now()).committed_step, 1);
     assert!(again.replay((None, 1), key_of(&seen())).is_some(), "with the answer that was kept");

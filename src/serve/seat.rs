@@ -78,10 +78,7 @@ impl Seat {
         match self.session.about_to_commit(&self.flight, &episode, &answer) {
             Ok(Some(write)) => store.submit(write, move |outcome| match outcome {
                 Ok(Ok(())) => self.stored(episode, answer, taken),
-                Ok(Err(refused)) => {
-                    self.session.fail(&self.flight, ServiceError::from_refused(refused));
-                    self.session.overtaken(refused);
-                }
+                Ok(Err(refused)) => self.session.lose(&self.flight, ServiceError::from_refused(refused), refused),
                 Err(error) => self.session.fail(&self.flight, ServiceError::from_store(&error)),
             }),
             Ok(None) => self.session.fail(&self.flight, ServiceError::SessionNotFound),
@@ -117,9 +114,11 @@ impl Drop for Seat {
         let (id, is_storing) = (Uuid::new_v4(), self.flight.is_storing());
         let (model, step) = (&self.session.model, self.flight.step);
         tracing::error!(%id, %model, step, is_storing, "an act was given up, for a defect of the server");
-        self.session.fail(&self.flight, ServiceError::EnginePanic { id });
+        let error = ServiceError::EnginePanic { id };
         if is_storing {
-            self.session.overtaken(Refused::Conflict);
+            self.session.lose(&self.flight, error, Refused::Conflict);
+        } else {
+            self.session.fail(&self.flight, error);
         }
     }
 }

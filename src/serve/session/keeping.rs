@@ -59,13 +59,36 @@ impl Session {
         Write { handle: self.handle, change }
     }
 
-    /// A commit was refused. Where the store knows another one, memory is behind: another server has gone on with the session, or a commit was kept that
+    /// A change was refused. Where the store knows another one, memory is behind: another server has gone on with the session, or a commit was kept that
     /// seemed to fail. It leaves memory, so that who asks next finds it as it is kept.
     pub fn overtaken(&self, refused: Refused) {
+        let left = match refused {
+            Refused::Conflict => self.leave_memory(),
+            Refused::Full => None,
+        };
+        if let Some(flight) = left {
+            flight.settle(Err(ServiceError::from_refused(refused)));
+        }
+    }
+
+    /// The same of a commit, of whose flight this becomes. First the session is gone from memory, then that is told: who asks at once finds no session that
+    /// ends under him.
+    pub fn lose(&self, flight: &Arc<Flight>, error: ServiceError, refused: Refused) {
         match refused {
-            Refused::Conflict => self.end(),
+            Refused::Conflict => drop(self.leave_memory()),
             Refused::Full => {}
         }
+        self.fail(flight, error);
+    }
+
+    /// The flight that it had.
+    fn leave_memory(&self) -> Option<Arc<Flight>> {
+        let mut slot = self.slot.lock();
+        slot.overtaken = true;
+        if !slot.ended {
+            self.end_slot(&mut slot);
+        }
+        slot.flight.take()
     }
 
     /// What is kept of it where it stands at this moment.

@@ -34,7 +34,7 @@ use crate::{
         engine::Patience,
         error::ServiceError,
         recording::Mark,
-        store::{UnixMs, unix_ms},
+        store::{Refused, UnixMs, unix_ms},
     },
 };
 use parking_lot::Mutex;
@@ -161,6 +161,8 @@ struct Slot {
     /// A new episode is on its way into the store.
     resetting: bool,
     ended: bool,
+    /// It has ended here because the store knows more of it.
+    overtaken: bool,
     /// Where it stands in the recording, if there is one.
     mark: Mark,
 }
@@ -204,6 +206,7 @@ impl Session {
             flight: None,
             resetting: false,
             ended: false,
+            overtaken: false,
             mark: Mark::default(),
         };
         Self { id, handle: Handle::of(id), model, agent, options, request_id, ttl, opened, bytes_total, slot: Mutex::new(slot) }
@@ -222,7 +225,7 @@ impl Session {
     ) -> Result<Entry, ServiceError> {
         let mut slot = self.slot.lock();
         if slot.ended {
-            return Err(ServiceError::SessionNotFound);
+            return Err(slot.gone());
         }
         slot.touched = now;
         slot.check_episode(episode)?;
@@ -305,7 +308,7 @@ impl Session {
     pub fn standing(&self, (episode, step): (Option<u64>, Option<u64>)) -> Result<(Arc<Episode>, Standing), ServiceError> {
         let slot = self.slot.lock();
         if slot.ended {
-            return Err(ServiceError::SessionNotFound);
+            return Err(slot.gone());
         }
         slot.check_episode(episode)?;
         let committed = slot.committed.step;
@@ -376,6 +379,11 @@ impl Session {
 }
 
 impl Slot {
+    /// What is told to whoever found it before it ended. One that is in the store is there for who asks again.
+    fn gone(&self) -> ServiceError {
+        if self.overtaken { ServiceError::from_refused(Refused::Conflict) } else { ServiceError::SessionNotFound }
+    }
+
     fn check_episode(&self, named: Option<u64>) -> Result<(), ServiceError> {
         match named {
             Some(episode) if episode != self.resets => {

@@ -39,7 +39,7 @@ impl Session {
     ) -> Result<Option<Reset>, ServiceError> {
         let mut slot = self.slot.lock();
         if slot.ended {
-            return Err(ServiceError::SessionNotFound);
+            return Err(slot.gone());
         }
         if slot.reset_ids.contains(&request_id) {
             slot.touched = now;

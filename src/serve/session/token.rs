@@ -93,7 +93,7 @@ impl Sealer {
     /// The token of a session, as [`Kept::write`] has it, and how long it holds, in milliseconds.
     pub fn seal(&self, kept: &[u8], now: UnixMs) -> (Vec<u8>, u64) {
         let (id, cipher) = &self.keys[0];
-        let head = [&MAGIC[..], &[VERSION], id, &(now + self.ttl_ms).to_le_bytes()].concat();
+        let head = [&MAGIC[..], &[VERSION], id, &now.saturating_add(self.ttl_ms).to_le_bytes()].concat();
         let nonce = nonce();
         let sealed = cipher.encrypt(&XNonce::from(nonce), Payload { msg: kept, aad: &head });
         let sealed = sealed.expect("a session is shorter than what a cipher takes: is a bug");

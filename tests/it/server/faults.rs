@@ -279,6 +279,6 @@ fn a_wrong_fault_is_refused() {
     let run = |word: &[&str]| binary(&[]).args(word).output().unwrap();
     let wrong = run(&["--fault", "evaluating=tickle"]);
     let said = String::from_utf8_lossy(&wrong.stderr).into_owned();
-    assert!(!wrong.status.success() && said.contains("there are kill, panic, hang, nonfinite"), "{said}");
+    assert!(!wrong.status.success() && said.contains("there are kill, panic, hang, leak, nonfinite"), "{said}");
     assert!(!String::from_utf8_lossy(&run(&["--help"]).stdout).contains("--fault"));
 }
