@@ -123,18 +123,7 @@ impl Keeper {
         if self.expire(handle, bytes, &kept) {
             return Err(ServiceError::SessionExpired);
         }
-        self.take_in(kept, registry)
-    }
-
-    /// Into memory, as it was kept.
-    fn take_in(&self, kept: Kept, registry: &Registry) -> Result<Arc<Session>, ServiceError> {
-        let Kept { id, request_id, opened, touched: _, record } = kept;
-        let model = registry.pinned(&record.model, &record.model_digest)?.clone();
-        let ttl = Duration::from_millis(record.ttl_ms);
-        let damaged = |(field, reason): (String, String)| ServiceError::corrupt(&format!("{field}: {reason}"));
-        let (episode, standing) = record.standing(&model.agent).map_err(damaged)?;
-        let opening = Opening { model: model.name, agent: model.agent, episode, standing, ttl, request_id, known: Some((id, opened)) };
-        self.table.revive(opening, Instant::now())
+        self.table.revive(opening_of(kept, registry)?, Instant::now())
     }
 
     /// Opens a session, and what ends it if its client is never told, as one that named its request need not be; or gives that which a request of this
@@ -175,7 +164,9 @@ impl Keeper {
     /// # Errors
     /// `TokenStale` where more is known here, `ModelGone`, `Quota`, `StoreFull`, `StoreUnavailable`.
     pub async fn resume(&self, kept: Kept, registry: &Registry) -> Result<Arc<Session>, ServiceError> {
-        let told = (kept.record.resets, kept.record.step);
+        let (told, write) = ((kept.record.resets, kept.record.step), |from| kept_anew(&kept, from));
+        // Before anything is let go: what does not fit the model costs nobody's session.
+        let opening = opening_of(kept.clone(), registry)?;
         let from = match self.find(kept.id, registry).await {
             Ok(session) => {
                 let (_, standing) = session.standing((None, None))?;
@@ -199,8 +190,8 @@ impl Keeper {
             Err(ServiceError::SessionNotFound | ServiceError::SessionExpired | ServiceError::SessionEvicted) => None,
             Err(error) => return Err(error),
         };
-        let write = kept_anew(&kept, from)?;
-        let session = self.take_in(kept, registry)?;
+        let write = write(from)?;
+        let session = self.table.revive(opening, Instant::now())?;
         if from.is_none() {
             metrics::counter!("ada_sessions_created_total").increment(1);
         }
@@ -379,6 +370,16 @@ impl Keeper {
             let _forgotten = store.home().forget_endings(before);
         }
     }
+}
+
+/// As it was kept, if the model could have left it so.
+fn opening_of(kept: Kept, registry: &Registry) -> Result<Opening, ServiceError> {
+    let Kept { id, request_id, opened, touched: _, record } = kept;
+    let model = registry.pinned(&record.model, &record.model_digest)?.clone();
+    let ttl = Duration::from_millis(record.ttl_ms);
+    let damaged = |(field, reason): (String, String)| ServiceError::corrupt(&format!("{field}: {reason}"));
+    let (episode, standing) = record.standing(&model.agent).map_err(damaged)?;
+    Ok(Opening { model: model.name, agent: model.agent, episode, standing, ttl, request_id, known: Some((id, opened)) })
 }
 
 /// What takes the place of what is there.

@@ -150,3 +150,32 @@ async fn a_head_is_that_of_its_record() {
         assert_eq!(read(&changed).unwrap_err().reason(), "STATE_CORRUPT", "byte {place}");
     }
 }
+
+/// A newer state from a token takes the place of what is here, with a store and without: who has an act in flight there is told to ask again. One that does not
+/// fit the model costs the session nothing, and an older one is refused.
+#[tokio::test]
+async fn a_newer_state_takes_the_place_of_an_older_one() {
+    let (_models, registry) = models();
+    let dir = tempfile::tempdir().unwrap();
+    for place in [dir.path().to_owned(), PathBuf::new()] {
+        let keeper = keeper(place);
+        let (session, _untold) = keeper.open(opening(&registry, LONG), &registry).await.unwrap();
+        let Change::Keep { bytes, .. } = next(&session).change else { panic!("a commit") };
+        let newer = read(&bytes).unwrap();
+        let mut unfit = newer.clone();
+        unfit.record.last = None;
+        assert_eq!(keeper.resume(unfit, &registry).await.err().unwrap().reason(), "STATE_CORRUPT");
+        let other = Observation { state: vec![0.2; 4], ..Observation::default() };
+        let Ok(Entry::Lead(waiter, _)) = session.enter((None, 1), key_of(&other), Instant::now(), Patience::default()) else {
+            panic!("it is here as it was")
+        };
+        let resumed = keeper.resume(newer.clone(), &registry).await.unwrap();
+        assert_eq!(resumed.summary(Instant::now()).committed_step, 1);
+        assert_eq!(waiter.outcome().await.unwrap_err().reason(), "STORE_UNAVAILABLE");
+        assert!(keeper.find(session.id, &registry).await.unwrap().replay((None, 1), key_of(&seen())).is_some());
+        let Change::Keep { bytes, .. } = next(&resumed).change else { panic!("a commit") };
+        assert_eq!(keeper.resume(read(&bytes).unwrap(), &registry).await.unwrap().summary(Instant::now()).committed_step, 2);
+        assert_eq!(keeper.resume(newer, &registry).await.err().unwrap().reason(), "TOKEN_STALE");
+        assert_eq!(keeper.table().len(), 1);
+    }
+}

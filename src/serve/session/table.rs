@@ -4,7 +4,7 @@ use crate::serve::{
     config::SessionsConfig,
     error::ServiceError,
     session::{Handle, Opening, Session},
-    store::{Ending, Store},
+    store::{Ending, Refused, Store},
 };
 use parking_lot::Mutex;
 use std::{
@@ -230,11 +230,11 @@ impl Sessions {
         }
     }
 
-    /// Lets a session go, in whose place another state of it comes: an act in flight is dropped.
+    /// Lets a session go, in whose place another state of it comes: who has an act in flight, or holds on to it, is told to ask again.
     pub fn let_go(&self, session: &Session) {
         if self.shard(session.handle).lock().live.remove(&session.handle).is_some() {
             self.forget(session);
-            session.end();
+            session.overtaken(Refused::Conflict);
         }
     }
 
