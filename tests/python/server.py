@@ -39,9 +39,10 @@ class Server:
         assert ready, f"the server ended, or is not ready after a minute:\n{self.said()}"
 
     def freeze(self) -> None:
-        """It does nothing any more, though its connections stand."""
+        """It does nothing any more, though its connections stand; a signal that is sent has not stopped every thread yet."""
         assert self._process
         self._process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, self._process.pid, os.WSTOPPED)
 
     def kill(self) -> None:
         """SIGKILL: it has no time to say or write anything."""
