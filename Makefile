@@ -35,7 +35,7 @@ test-rust: tools
 	cargo test $(CARGO_FLAGS)
 
 test-python: test-binaries venv
-	$(BIN)/python -m pytest -q tests/python
+	$(BIN)/python -m pytest -q --durations=20 tests/python
 
 lint: venv ## Formatting, clippy, docs and ruff, all with warnings as errors.
 	cargo fmt --check
@@ -57,11 +57,17 @@ chaos: ## Kills servers while sessions act, and looks for acts that are lost or 
 	cargo build $(CARGO_FLAGS) --bins --example chaos
 	target/release/examples/chaos --kills $(KILLS) --durability $(DURABILITY)
 
+SEEDS ?= 1000
+SIMULATE ?=
+simulate: ## The whole server in a simulated world, in stories that are drawn from seeds: make simulate SEEDS=20000; SIMULATE=--help tells more.
+	cargo build $(CARGO_FLAGS) --example simulate
+	target/release/examples/simulate --seeds $(SEEDS) $(SIMULATE)
+
 MINUTES ?= 120
 soak: build venv ## Hours of mixed work on one server, whose memory has to stay and whose counters have to add up: make soak MINUTES=120
 	$(BIN)/python -m tests.soak --minutes $(MINUTES)
 
-.PHONY: chaos soak reliability-tools
+.PHONY: chaos simulate soak reliability-tools
 reliability-tools: .venv-reliability/.ready
 .venv-reliability/.ready: tests/reliability/requirements.txt | tools
 	$(PYTHON) -m venv .venv-reliability

@@ -66,6 +66,8 @@
 //! | a restart of a window that is not trusted | `model/agent/restart.rs` |
 //! | a session as bytes; an episode that was written down, taken up again | [`serve::session::Record`], [`model::agent::Agent::adopt`] |
 //! | a session that outlives the process: what is written, when, and where | `serve/session/keeping.rs`, `serve/keeper.rs`, [`serve::store`] |
+//! | the whole server in a simulated world, and what it needs of a network, a disk and a clock | `examples/simulate`, [`serve::net`], [`serve::service::Service::by_hand`] |
+//! | the points at which those who share a session may overtake one another | `serve/session/lock.rs`, `interleaving_tests.rs` |
 //! | an act that panics, a number that is not finite, a thread that hangs; all of them on demand | [`serve::engine`] (`worker.rs`, `pulse.rs`), `serve/session/poison.rs`, [`model::agent::Place`], [`serve::fault`] |
 //! | an act that was recorded, and how it is done again | [`serve::recording`], [`serve::replay`], [`model::agent::Haste`] |
 //! | an option of a session, from the wire to the sampler | [`serve::options`], [`model::options`] |

@@ -1,10 +1,7 @@
 //! One server after the other, on the same port and the same store.
 
 use super::flags::{Control, Flags};
-use ada_diffuser::{
-    model::noise::Philox,
-    serve::grpc::pb::{ListSessionsRequest, agent_client::AgentClient},
-};
+use ada_diffuser::model::noise::Philox;
 use anyhow::{Context, bail};
 use std::{
     fs,
@@ -243,22 +240,5 @@ impl Process {
         self.child.kill()?;
         spawn_blocking(move || self.child.wait()).await??;
         Ok(())
-    }
-
-    /// Sessions that it lists.
-    ///
-    /// # Errors
-    /// If it does not answer.
-    pub async fn sessions(&mut self) -> anyhow::Result<usize> {
-        let mut agent = AgentClient::connect(format!("http://{}", self.address)).await?;
-        let (mut count, mut request) = (0, ListSessionsRequest::default());
-        loop {
-            let page = agent.list_sessions(request.clone()).await?.into_inner();
-            count += page.sessions.len();
-            if page.next_page_token.is_empty() {
-                return Ok(count);
-            }
-            request.page_token = page.next_page_token;
-        }
     }
 }

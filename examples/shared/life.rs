@@ -1,9 +1,6 @@
-//! One session after the other as a client lives it, beside the truth.
+//! One session after the other as a client lives it, beside the truth; whether its servers are real or simulated.
 
-use super::{
-    flags::{Control, Flags},
-    tally::{Done, Fault, Tally},
-};
+use super::tally::{Done, Fault, Tally};
 use ada_diffuser::{
     model::{
         agent::{Agent, Chunk, Episode, Observation},
@@ -12,31 +9,48 @@ use ada_diffuser::{
     },
     serve::grpc::pb::{self, agent_client::AgentClient},
 };
-use std::{future::Future, net::SocketAddr, sync::Arc, time::Duration};
+use futures_util::future::BoxFuture;
+use std::{future::Future, sync::Arc, time::Duration};
 use tokio::time::{Instant, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Response, Status, transport::Channel};
 
-/// A call that is not answered by then is made again.
-const CALL_MAX: Duration = Duration::from_secs(10);
 /// What is not answered by then is lost.
 const ANSWER_MAX: Duration = Duration::from_secs(60);
 /// Between two tries.
 const PAUSE: Duration = Duration::from_millis(5);
 
-type Client = AgentClient<Channel>;
+/// Of the server.
+pub type Client = AgentClient<Channel>;
+
+/// How a client comes to its server; None: it is not there.
+pub type Dial = Arc<dyn Fn() -> BoxFuture<'static, Option<Client>> + Send + Sync>;
+
+/// What a life is lived with.
+#[derive(Clone)]
+pub struct Lot {
+    /// What acts.
+    pub agent: Arc<Agent>,
+    /// Its name.
+    pub model: String,
+    /// Of all lives.
+    pub seed: u64,
+    /// Of this one.
+    pub number: u32,
+    /// A call that is not answered by then is made again.
+    pub call_max: Duration,
+    /// A control: its server computes with other noise than the one that it is held against.
+    pub noise_is_wrong: bool,
+}
 
 /// A client that drives a session, and computes on its own what it has to be told.
 pub struct Life {
-    agent: Arc<Agent>,
-    model: String,
+    lot: Lot,
     options: SamplerOptions,
-    address: SocketAddr,
+    dial: Dial,
     client: Option<Client>,
     dice: Philox,
-    noise_is_wrong: bool,
-    /// For the names of requests.
-    number: u32,
+    /// For their names.
     requests: u64,
     session: Option<Session>,
     tally: Arc<Tally>,
@@ -53,12 +67,11 @@ struct Session {
 }
 
 impl Life {
-    /// The client of this number, which has no session yet.
-    pub fn new((agent, model): (Arc<Agent>, String), (flags, number): (&Flags, u32), address: SocketAddr, tally: Arc<Tally>) -> Self {
-        let options = SamplerOptions { eta: 0.7, temperature: 1.0, ..agent.spec().sampler.clone() };
-        let dice = Philox::named(flags.seed, &format!("chaos.life.{number}"));
-        let noise_is_wrong = flags.control == Control::Noise;
-        Self { agent, model, options, address, client: None, dice, noise_is_wrong, number, requests: 0, session: None, tally }
+    /// A client that has no session yet.
+    pub fn new(lot: Lot, dial: Dial, tally: Arc<Tally>) -> Self {
+        let options = SamplerOptions { eta: 0.7, temperature: 1.0, ..lot.agent.spec().sampler.clone() };
+        let dice = Philox::named(lot.seed, &format!("chaos.life.{}", lot.number));
+        Self { lot, options, dial, client: None, dice, requests: 0, session: None, tally }
     }
 
     /// Acts, and now and then asks again, begins a new episode or leaves for another session, until it is to stop.
@@ -104,7 +117,7 @@ impl Life {
         let (seed, request_id) = (self.dice.below(1_000_000) as u64, self.name());
         let options = pb::SamplerOptions { eta: Some(self.options.eta), temperature: Some(self.options.temperature), ..Default::default() };
         let request = pb::OpenSessionRequest {
-            model: self.model.clone(),
+            model: self.lot.model.clone(),
             seed: Some(seed),
             options: Some(options),
             request_id,
@@ -163,11 +176,11 @@ impl Life {
     }
 
     async fn act(&mut self) -> Result<(), Fault> {
-        let state: Vec<f32> = (0..self.agent.spec().layout.state_dim).map(|_| self.dice.below(2_001) as f32 / 1_000.0 - 1.0).collect();
+        let state: Vec<f32> = (0..self.lot.agent.spec().layout.state_dim).map(|_| self.dice.below(2_001) as f32 / 1_000.0 - 1.0).collect();
         let Some(session) = &self.session else { return Ok(()) };
         let seen = Observation { state: state.clone(), ..Observation::default() };
         let (after, expected) =
-            self.agent.act(&session.state, &seen).map_err(|error| Fault::Different(format!("the truth cannot be had: {error}")))?;
+            self.lot.agent.act(&session.state, &seen).map_err(|error| Fault::Different(format!("the truth cannot be had: {error}")))?;
         let step = session.step + 1;
         let request = pb::ActRequest {
             session_id: session.id.clone(),
@@ -230,13 +243,13 @@ impl Life {
     }
 
     fn begun(&self, seed: u64) -> Result<Episode, Fault> {
-        let seed = seed + u64::from(self.noise_is_wrong);
-        self.agent.open(seed, &self.options).map_err(|error| Fault::Different(format!("the truth cannot be had: {error}")))
+        let seed = seed + u64::from(self.lot.noise_is_wrong);
+        self.lot.agent.open(seed, &self.options).map_err(|error| Fault::Different(format!("the truth cannot be had: {error}")))
     }
 
     fn name(&mut self) -> String {
         self.requests += 1;
-        format!("{}.{}", self.number, self.requests)
+        format!("{}.{}", self.lot.number, self.requests)
     }
 
     /// Calls until there is an answer: the same call, whatever became of the one before.
@@ -247,7 +260,7 @@ impl Life {
         let begin = Instant::now();
         while begin.elapsed() < ANSWER_MAX {
             if let Some(client) = self.connected().await {
-                match timeout(CALL_MAX, call(client)).await {
+                match timeout(self.lot.call_max, call(client)).await {
                     Ok(Ok(answer)) => return Ok(answer.into_inner()),
                     Ok(Err(status)) => self.may_ask_again(&status)?,
                     Err(_) => {}
@@ -260,9 +273,28 @@ impl Life {
         Err(Fault::Lost("no answer for a minute".into()))
     }
 
+    /// Sessions that the server lists.
+    pub async fn listed(&mut self) -> Option<usize> {
+        let (mut count, mut request) = (0, pb::ListSessionsRequest::default());
+        loop {
+            let page = self
+                .call(|mut client| {
+                    let request = request.clone();
+                    async move { client.list_sessions(request).await }
+                })
+                .await
+                .ok()?;
+            count += page.sessions.len();
+            if page.next_page_token.is_empty() {
+                return Some(count);
+            }
+            request.page_token = page.next_page_token;
+        }
+    }
+
     async fn connected(&mut self) -> Option<Client> {
         if self.client.is_none() {
-            self.client = Client::connect(format!("http://{}", self.address)).await.ok();
+            self.client = timeout(self.lot.call_max, (self.dial)()).await.ok().flatten();
         }
         self.client.clone()
     }
@@ -273,7 +305,7 @@ impl Life {
         match reason {
             // Nobody has answered: the server is gone.
             None if matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::Internal) => Ok(()),
-            Some("NOT_READY" | "DRAINING" | "STORE_UNAVAILABLE" | "QUEUE_FULL" | "SESSION_BUSY") => Ok(()),
+            Some("NOT_READY" | "DRAINING" | "STORE_UNAVAILABLE" | "STORE_FULL" | "QUEUE_FULL" | "QUOTA" | "SESSION_BUSY") => Ok(()),
             Some("SESSION_NOT_FOUND" | "SESSION_EXPIRED" | "SESSION_EVICTED" | "STEP_OUT_OF_ORDER") => Err(Fault::Lost(what())),
             Some("STATE_CORRUPT") => Err(Fault::Corrupt(what())),
             _ => Err(Fault::Different(what())),

@@ -5,7 +5,7 @@ use crate::serve::{
     request::{Acted, Caller},
     session::Answer,
 };
-use std::time::Instant;
+use tokio::time::Instant;
 
 /// An act on its way through the metrics: whatever becomes of it is counted once, and also that nobody waited for it any more.
 pub(super) struct Count {

@@ -12,13 +12,8 @@ use crate::serve::{
     },
 };
 use parking_lot::Mutex;
-use std::{
-    cmp::Ordering,
-    io,
-    sync::Arc,
-    time::{Duration, Instant},
-};
-use tokio::{sync::oneshot, task::spawn_blocking};
+use std::{cmp::Ordering, io, sync::Arc, time::Duration};
+use tokio::{sync::oneshot, task::spawn_blocking, time::Instant};
 use uuid::Uuid;
 
 /// Pages of the store that one page of a list looks at: a list of one model among many must not take for ever.
@@ -61,8 +56,12 @@ impl Keeper {
     /// If it cannot be opened.
     pub fn open_store(sessions: &SessionsConfig, config: &StoreConfig) -> Result<Self, KeeperError> {
         let in_memory = config.dir.as_os_str().is_empty() || config.durability == Durability::Memory;
-        let store = if in_memory { None } else { Some(Arc::new(start(config)?)) };
-        Ok(Self {
+        Ok(Self::over(sessions, config, if in_memory { None } else { Some(Arc::new(start(config)?)) }))
+    }
+
+    /// Over this store.
+    pub fn over(sessions: &SessionsConfig, config: &StoreConfig, store: Option<Arc<Store>>) -> Self {
+        Self {
             table: Arc::new(Sessions::new(sessions.clone(), store.clone())),
             store,
             config: config.clone(),
@@ -70,7 +69,7 @@ impl Keeper {
             began: unix_ms(),
             recorder: None,
             swept: Mutex::default(),
-        })
+        }
     }
 
     /// With a recording of what happens to them.

@@ -7,6 +7,7 @@ use crate::serve::{
     grpc::{self, endless},
     guard::Guard,
     http::Problem,
+    net::{Listener, Stream},
     session::Untold,
     wire::{Bounds, Watched, Wire},
 };
@@ -23,19 +24,10 @@ use hyper_util::{
     rt::{TokioExecutor, TokioIo, TokioTimer},
     server::conn::auto,
 };
-use std::{
-    convert::Infallible,
-    error::Error,
-    io,
-    panic::AssertUnwindSafe,
-    pin::pin,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{convert::Infallible, error::Error, io, panic::AssertUnwindSafe, pin::pin, sync::Arc, time::Duration};
 use tokio::{
     io::{AsyncWriteExt, copy, sink},
-    net::{TcpListener, TcpStream},
-    time::{interval, sleep, timeout},
+    time::{Instant, interval, sleep, timeout},
 };
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tower::ServiceExt;
@@ -67,7 +59,7 @@ pub struct Faces {
 }
 
 /// Serves both faces until `leave` is cancelled, then lets every request in flight end, for `server.drain_timeout_ms` at most.
-pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
+pub async fn serve(listener: impl Listener, faces: Faces, config: Arc<Config>, leave: CancellationToken) {
     let (tracker, hard_end) = (TaskTracker::new(), CancellationToken::new());
     let (places, held) = (Places::new(&config.server), Held::new(&config.server));
     loop {
@@ -102,7 +94,7 @@ pub async fn serve(listener: TcpListener, faces: Faces, config: Arc<Config>, lea
 }
 
 /// One connection too many: REST clients understand the answer, gRPC clients see UNAVAILABLE.
-fn turn_away(mut stream: TcpStream) {
+fn turn_away(mut stream: impl Stream) {
     metrics::counter!("ada_connections_refused_total").increment(1);
     let full = Problem::new(StatusCode::SERVICE_UNAVAILABLE, "CONNECTIONS_FULL", "there is no place for another connection");
     let answer = full.after(RETRY_AFTER_FULL_MS).into_http1();
@@ -115,11 +107,11 @@ fn turn_away(mut stream: TcpStream) {
     tokio::spawn(timeout(ACCEPT_PAUSE, tell));
 }
 
-async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, gate: Gate, activity: Arc<Activity>) {
+async fn connection(mut stream: impl Stream, faces: Faces, config: Arc<Config>, gate: Gate, activity: Arc<Activity>) {
     metrics::gauge!("ada_connections").increment(1.0);
     let patience = Duration::from_millis(config.connection.preface_timeout_ms);
     let greeted = tokio::select! {
-        greeted = timeout(patience, has_spoken(&stream)) => greeted,
+        greeted = timeout(patience, has_spoken(&mut stream)) => greeted,
         () = gate.leave().cancelled() => Ok(false),
     };
     match greeted {
@@ -131,7 +123,7 @@ async fn connection(stream: TcpStream, faces: Faces, config: Arc<Config>, gate: 
 }
 
 /// Waits until the first bytes decide between HTTP/1 and HTTP/2; false if the peer leaves before. The stock builder would wait for them for ever.
-async fn has_spoken(stream: &TcpStream) -> bool {
+async fn has_spoken(stream: &mut impl Stream) -> bool {
     let mut seen = [0; PREFACE.len()];
     loop {
         match stream.peek(&mut seen).await {
@@ -142,8 +134,8 @@ async fn has_spoken(stream: &TcpStream) -> bool {
     }
 }
 
-async fn talk(stream: TcpStream, faces: Faces, config: &Config, gate: &Gate, activity: &Arc<Activity>) {
-    if let Err(error) = stream.set_nodelay(true) {
+async fn talk(stream: impl Stream, faces: Faces, config: &Config, gate: &Gate, activity: &Arc<Activity>) {
+    if let Err(error) = stream.send_at_once() {
         tracing::debug!(%error, "no TCP_NODELAY");
     }
     let ms = Duration::from_millis;

@@ -17,6 +17,7 @@ pub mod http;
 pub mod idle;
 mod keeper;
 pub mod listener;
+pub mod net;
 pub mod options;
 pub mod recording;
 pub mod registry;
@@ -33,6 +34,7 @@ mod wire;
 use config::Config;
 use guard::Guard;
 use listener::Faces;
+use net::Listener;
 use registry::{Registry, RegistryError};
 use service::{Service, StartError};
 use std::{future::Future, io, net::SocketAddr, sync::Arc, time::Duration};
@@ -107,45 +109,62 @@ impl Server {
     /// If there is no model to serve or the engine does not start.
     pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<(), ServerError> {
         let Self { listener, config } = self;
-        let metrics = telemetry::install_metrics();
+        let address = listener.local_addr().ok();
+        // Before anything is counted.
+        telemetry::install_metrics();
         let service = Arc::new(Service::start(config.clone())?);
-        let (grpc, health) = grpc::router(service.clone())?;
-        grpc::report(&health, false).await;
-        let guard = Guard::new(&config.server, listener.local_addr().ok());
-        let http = http::router(http::State { service: service.clone(), metrics: metrics.clone() }).layer(guard.cors());
-        let faces = Faces { grpc, http, guard };
-        let leave = CancellationToken::new();
-        let mut listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), leave.clone()));
-        let serving = async {
-            load(&service, config.clone()).await?;
-            grpc::report(&health, true).await;
-            tracing::info!(address = %config.server.listen, "ready");
-            housekeeping(service.clone(), &health, || metrics.run_upkeep()).await;
-            Ok(())
-        };
-        let served = tokio::select! {
-            () = shutdown => {
-                tracing::info!("draining");
-                Ok(())
-            }
-            served = serving => served,
-            // Without it the process would live on and take no more connections.
-            _ended = &mut listening => Err(ServerError::Accept),
-        };
-        grpc::report(&health, false).await;
-        service.drain();
-        sleep(Duration::from_millis(config.server.drain_notice_ms)).await;
-        leave.cancel();
-        if !matches!(served, Err(ServerError::Accept)) && listening.await.is_err() {
-            tracing::error!("the accept loop ended by panic");
-        }
-        let stopping = spawn_blocking(move || service.stop(ENGINE_PATIENCE));
-        if stopping.await.is_err() {
-            tracing::error!("the engine's end panicked");
-        }
-        tracing::info!("ended");
-        served
+        let loading = load(service.clone(), config);
+        serve((listener, address), service, loading, shutdown).await
     }
+}
+
+/// Serves both faces where connections come from, until `shutdown` is ready, and then drains; with the models that are ready in a while.
+///
+/// # Errors
+/// If the models cannot be had, or the accept loop ends.
+pub async fn serve(
+    (listener, address): (impl Listener, Option<SocketAddr>),
+    service: Arc<Service>,
+    loading: impl Future<Output = Result<Registry, ServerError>>,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), ServerError> {
+    let (metrics, config) = (telemetry::install_metrics(), service.config().clone());
+    let (grpc, health) = grpc::router(service.clone())?;
+    grpc::report(&health, false).await;
+    let guard = Guard::new(&config.server, address);
+    let http = http::router(http::State { service: service.clone(), metrics: metrics.clone() }).layer(guard.cors());
+    let faces = Faces { grpc, http, guard };
+    let leave = CancellationToken::new();
+    let mut listening = tokio::spawn(listener::serve(listener, faces, Arc::new(config.clone()), leave.clone()));
+    let serving = async {
+        service.set_registry(loading.await?);
+        grpc::report(&health, true).await;
+        tracing::info!(address = %config.server.listen, "ready");
+        housekeeping(service.clone(), &health, || metrics.run_upkeep()).await;
+        Ok(())
+    };
+    let served = tokio::select! {
+        () = shutdown => {
+            tracing::info!("draining");
+            Ok(())
+        }
+        served = serving => served,
+        // Without it the process would live on and take no more connections.
+        _ended = &mut listening => Err(ServerError::Accept),
+    };
+    grpc::report(&health, false).await;
+    service.drain();
+    sleep(Duration::from_millis(config.server.drain_notice_ms)).await;
+    leave.cancel();
+    if !matches!(served, Err(ServerError::Accept)) && listening.await.is_err() {
+        tracing::error!("the accept loop ended by panic");
+    }
+    let stopping = spawn_blocking(move || service.stop(ENGINE_PATIENCE));
+    if stopping.await.is_err() {
+        tracing::error!("the engine's end panicked");
+    }
+    tracing::info!("ended");
+    served
 }
 
 /// Of the addresses of a name the first that can be had. Examples and clients say 127.0.0.1, so of `localhost` it must not be ::1 alone.
@@ -155,12 +174,9 @@ async fn listen(address: &str) -> io::Result<TcpListener> {
     TcpListener::bind(&addresses[..]).await
 }
 
-async fn load(service: &Arc<Service>, config: Config) -> Result<(), ServerError> {
-    let warm = service.clone();
-    let loading = move || Registry::load(&config.models).and_then(|registry| warm.warm_up(registry));
-    let loaded = spawn_blocking(loading).await;
-    service.set_registry(loaded.map_err(|panic| ServerError::Loading(io::Error::other(panic)))??);
-    Ok(())
+async fn load(service: Arc<Service>, config: Config) -> Result<Registry, ServerError> {
+    let loaded = spawn_blocking(move || Registry::load(&config.models).and_then(|registry| service.warm_up(registry))).await;
+    Ok(loaded.map_err(|panic| ServerError::Loading(io::Error::other(panic)))??)
 }
 
 async fn housekeeping(service: Arc<Service>, health: &HealthReporter, upkeep: impl Fn()) {

@@ -4,7 +4,8 @@ use crate::{
     model::{agent::Agent, checkpoint, nn::Precision},
     serve::{config::ModelsConfig, error::ServiceError},
 };
-use std::{collections::BTreeMap, fs, io, path::Path, path::PathBuf, sync::Arc, time::Instant};
+use std::{collections::BTreeMap, fs, io, path::Path, path::PathBuf, sync::Arc};
+use tokio::time::Instant;
 
 /// Digits of a digest that a client must at least name.
 const DIGEST_PREFIX_MIN: usize = 8;
@@ -23,6 +24,7 @@ pub struct Model {
 }
 
 /// The loaded models.
+#[derive(Clone)]
 pub struct Registry {
     models: BTreeMap<Arc<str>, Model>,
     default: Arc<str>,

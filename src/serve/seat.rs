@@ -11,7 +11,8 @@ use crate::{
         store::{Refused, Store},
     },
 };
-use std::{sync::Arc, time::Instant};
+use std::sync::Arc;
+use tokio::time::Instant;
 use uuid::Uuid;
 
 /// What a client is told to wait when the server is ending.

@@ -2,8 +2,9 @@
 
 use std::{
     thread::{JoinHandle, sleep},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 const POLL: Duration = Duration::from_millis(5);
 

@@ -4,7 +4,7 @@
 //! large HTTP/2 tells its status and nothing else.) And when it closes while the peer is still sending, the system cuts the connection, and the
 //! peer may lose the answer that says why: so what still comes is read and dropped, for a while.
 
-use crate::serve::{config::Config, error::ServiceError, gate::Gate, http::Problem};
+use crate::serve::{config::Config, error::ServiceError, gate::Gate, http::Problem, net::Stream};
 use axum::{
     body::{Bytes, HttpBody},
     http::StatusCode,
@@ -18,7 +18,6 @@ use std::{
 };
 use tokio::{
     io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf},
-    net::TcpStream,
     runtime::Handle,
     time::timeout,
 };
@@ -32,9 +31,9 @@ const SILENCE_MAX: Duration = Duration::from_secs(1);
 const OURS: &[u8] = b"x-request-id";
 
 /// See the module.
-pub struct Wire {
+pub struct Wire<S: Stream> {
     /// None once it is dropped.
-    stream: Option<Pin<Box<TimeoutStream<TcpStream>>>>,
+    stream: Option<Pin<Box<TimeoutStream<S>>>>,
     /// What is being written in the place of a bare answer.
     instead: Vec<u8>,
     has_ended: bool,
@@ -66,15 +65,15 @@ impl Bounds {
     }
 }
 
-impl Wire {
+impl<S: Stream> Wire<S> {
     /// Of this connection.
-    pub fn new(stream: TcpStream, gate: Gate, bounds: Bounds) -> Self {
+    pub fn new(stream: S, gate: Gate, bounds: Bounds) -> Self {
         let mut stream = TimeoutStream::new(stream);
         stream.set_write_timeout(Some(bounds.write));
         Self { stream: Some(Box::pin(stream)), instead: Vec::new(), has_ended: false, bounds, gate }
     }
 
-    fn stream(&mut self) -> Pin<&mut TimeoutStream<TcpStream>> {
+    fn stream(&mut self) -> Pin<&mut TimeoutStream<S>> {
         self.stream.as_mut().expect("it is there until it is dropped, or it is a bug").as_mut()
     }
 
@@ -101,7 +100,7 @@ fn bare_status(bytes: &[u8]) -> Option<StatusCode> {
     if is_bare { StatusCode::from_bytes(status).ok() } else { None }
 }
 
-impl AsyncRead for Wire {
+impl<S: Stream> AsyncRead for Wire<S> {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let (before, has_room) = (buffer.filled().len(), buffer.remaining() > 0);
         ready!(self.stream().poll_read(cx, buffer))?;
@@ -110,7 +109,7 @@ impl AsyncRead for Wire {
     }
 }
 
-impl AsyncWrite for Wire {
+impl<S: Stream> AsyncWrite for Wire<S> {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         if self.instead.is_empty() {
             let Some(status) = bare_status(bytes) else { return self.stream().poll_write(cx, bytes) };
@@ -147,7 +146,7 @@ impl AsyncWrite for Wire {
     }
 }
 
-impl Drop for Wire {
+impl<S: Stream> Drop for Wire<S> {
     fn drop(&mut self) {
         let (Some(stream), false, true) = (self.stream.take(), self.has_ended, self.gate.lingers()) else { return };
         // Without a runtime the process ends, and all connections with it.
@@ -158,7 +157,7 @@ impl Drop for Wire {
 }
 
 /// Reads and drops what a peer still sends, so that it can read the answer; meanwhile the connection keeps its place.
-async fn linger(mut stream: Pin<Box<TimeoutStream<TcpStream>>>, gate: Gate, bounds: Bounds) {
+async fn linger(mut stream: Pin<Box<TimeoutStream<impl Stream>>>, gate: Gate, bounds: Bounds) {
     let drop_all = async {
         let (mut dropped, mut left) = ([0; 16_384], bounds.dropped_bytes_max);
         let _gone = tokio::io::AsyncWriteExt::shutdown(&mut stream).await;

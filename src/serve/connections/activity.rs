@@ -10,8 +10,9 @@ use std::{
         Arc, Weak,
         atomic::{AtomicU64, AtomicUsize, Ordering},
     },
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 /// The bytes that the server holds because of its clients: requests that are on their way in or in work, answers that are not taken. Beyond

@@ -9,8 +9,9 @@ use crate::model::{
 use parking_lot::RwLock;
 use std::{
     sync::{Arc, Weak},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 /// Acts of each length that are timed, and their ticks; the fastest counts, for the first ones find no memory yet.
 const ROUNDS: usize = 3;

@@ -23,11 +23,13 @@ use queue::{Ask, Bounds, Place, Queue};
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, Weak, mpsc},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 use worker::Crew;
 
 pub use queue::Refusal;
+pub use worker::Hand;
 
 /// The other end of a submitted act. One that is dropped before it is settled was given up; it should tell whoever waits.
 pub trait Ticket: Send + 'static {
@@ -191,7 +193,7 @@ struct Shared<T> {
     queue: Queue<Box<Job<T>>>,
     options: EngineOptions,
     tariff: Tariff,
-    /// For each worker; None after the end.
+    /// For each thread; None after the end.
     warm_ups: Vec<Mutex<Option<Vec<WarmUp>>>>,
     faults: Faults,
 }
@@ -202,16 +204,17 @@ impl<T: Ticket> Engine<T> {
     /// # Errors
     /// If the system gives no more threads.
     pub fn start(options: EngineOptions, faults: Faults) -> std::io::Result<Self> {
-        let workers = options.workers;
-        let shared = Arc::new(Shared {
-            queue: Queue::new(Bounds { len: options.queue_len_max, bytes: options.queue_bytes_max }, workers),
-            options,
-            tariff: Tariff::default(),
-            warm_ups: (0..workers).map(|_| Mutex::new(Some(Vec::new()))).collect(),
-            faults,
-        });
+        let shared = Shared::new(options, options.workers, faults);
         let crew = Mutex::new(Crew::start(&shared)?);
         Ok(Self { shared, crew })
+    }
+
+    /// Without threads, and what does their work in their place. There is no warm-up, so that its acts are never hurried.
+    pub fn by_hand(options: EngineOptions, faults: Faults) -> (Self, Hand<T>) {
+        let options = EngineOptions { workers: 1, ..options };
+        let shared = Shared::new(options, 0, faults);
+        let hand = Hand::of(shared.clone());
+        (Self { shared, crew: Mutex::default() }, hand)
     }
 
     /// Runs ticks of every batch length on every worker, so that the first acts find memory and code in place, and measures them. Waits
@@ -295,6 +298,16 @@ impl<T: Ticket> Drop for Engine<T> {
 }
 
 impl<T: Ticket> Shared<T> {
+    fn new(options: EngineOptions, threads: usize, faults: Faults) -> Arc<Self> {
+        Arc::new(Self {
+            queue: Queue::new(Bounds { len: options.queue_len_max, bytes: options.queue_bytes_max }, options.workers),
+            options,
+            tariff: Tariff::default(),
+            warm_ups: (0..threads).map(|_| Mutex::new(Some(Vec::new()))).collect(),
+            faults,
+        })
+    }
+
     /// What an act asks of the queue; None: it would come too late without any wait. Of a model that was never measured nothing is known.
     fn ask(&self, job: &Job<T>) -> Option<Ask> {
         let bytes = size_of::<Job<T>>() + job.question.observation.size_bytes() + job.act.size_bytes();

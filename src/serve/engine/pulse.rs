@@ -5,8 +5,9 @@
 
 use std::{
     sync::atomic::{AtomicBool, AtomicU64, Ordering},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 /// An evaluation may take so many times as long as warm-up found: more is no busy machine any more.
 const SLOW: u32 = 10;

@@ -8,8 +8,9 @@
 use parking_lot::{Condvar, Mutex};
 use std::{
     collections::{BTreeMap, HashMap},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 /// How long an idle worker sleeps before it shows itself again.
 const IDLE_WAIT: Duration = Duration::from_millis(250);

@@ -11,10 +11,8 @@ use crate::{
     model::agent::{Act, Agent, Chunk, Episode, Haste},
     serve::fault::{Faults, Harm, Point},
 };
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{sync::Arc, time::Duration};
+use tokio::time::Instant;
 
 /// The acts in progress of one worker, by model.
 pub(super) struct Batch<T> {
@@ -165,8 +163,8 @@ impl<T: Ticket> Batch<T> {
     }
 
     /// The end: whoever is left fails.
-    pub fn stop(self) {
-        for group in self.groups {
+    pub fn stop(&mut self) {
+        for group in self.groups.drain(..) {
             group.acts.iter().for_each(count_waste);
             group.riders.into_iter().for_each(|rider| rider.ticket.settle(Err(Failure::Stopped)));
         }

@@ -8,8 +8,9 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
     thread::{Builder, JoinHandle, sleep},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 const STACK_BYTES: usize = 8 << 20;
 /// After a panic outside of an act: what panics each time must not take the processor.
@@ -56,6 +57,7 @@ impl Worker {
 }
 
 /// All threads of an engine.
+#[derive(Default)]
 pub(super) struct Crew {
     /// By index.
     at_work: Vec<Worker>,
@@ -116,6 +118,32 @@ impl Crew {
 
     fn all(&self) -> impl Iterator<Item = &Worker> {
         self.at_work.iter().chain(&self.relieved)
+    }
+}
+
+/// A worker without a thread: it works when it is told to. In a simulation nothing happens at the same time as something else, and time stands still meanwhile.
+pub struct Hand<T: Ticket> {
+    shared: Arc<Shared<T>>,
+    batch: Batch<T>,
+}
+
+impl<T: Ticket> Hand<T> {
+    pub(super) fn of(shared: Arc<Shared<T>>) -> Self {
+        let pulse = Arc::new(Pulse::new(shared.options.silence_max));
+        let batch = Batch::new(shared.options, pulse, shared.faults.clone());
+        Self { shared, batch }
+    }
+
+    /// Takes what arrived, and one network evaluation of all that it holds; false: there was nothing to do.
+    pub fn turn(&mut self) -> bool {
+        // The queue would wait for something to come.
+        let has_work = self.shared.queue.load().0 + self.batch.len() > 0;
+        if has_work && take(&self.shared, 0, &mut self.batch) {
+            self.batch.tick();
+        } else {
+            self.batch.stop();
+        }
+        has_work
     }
 }
 

@@ -28,9 +28,9 @@ use std::{
         atomic::{AtomicUsize, Ordering},
     },
     task::Poll,
-    time::{Duration, Instant},
+    time::Duration,
 };
-use tokio::time::{Interval, interval, timeout};
+use tokio::time::{Instant, Interval, interval, timeout};
 use tokio_util::sync::CancellationToken;
 use tungstenite::error::{CapacityError, Error as Failure, ProtocolError};
 

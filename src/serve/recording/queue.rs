@@ -5,11 +5,8 @@ use crate::{
     serve::session::{Handle, Key, Record},
 };
 use parking_lot::{Condvar, Mutex};
-use std::{
-    collections::VecDeque,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{collections::VecDeque, sync::Arc, time::Duration};
+use tokio::time::Instant;
 
 /// How long notes gather before they are written, unless half of the room is taken: to wake the writer for each would cost each act more than all else.
 const GATHER: Duration = Duration::from_millis(20);

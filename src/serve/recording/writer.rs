@@ -16,8 +16,9 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
     thread::{Builder, JoinHandle},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 /// How often it is tried whether a recording can go on.
 const RETRY: Duration = Duration::from_secs(1);

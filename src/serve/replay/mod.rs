@@ -21,8 +21,9 @@ use player::Player;
 use std::{
     io::{self, Write},
     path::{Path, PathBuf},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 /// How often progress is told.
 const TOLD_EACH: Duration = Duration::from_millis(100);

@@ -23,8 +23,9 @@ use crate::{
 use std::{
     collections::{HashMap, VecDeque},
     sync::{Arc, mpsc},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 /// Entries that wait for their sessions, beyond what the engine can work on: a file whose sessions take turns is read no further ahead.
 const AHEAD: usize = 4_096;

@@ -18,9 +18,9 @@ use std::{
         Arc,
         atomic::{AtomicUsize, Ordering},
     },
-    time::{Duration, Instant},
+    time::Duration,
 };
-use tokio::time::{sleep, timeout_at};
+use tokio::time::{Instant, sleep, timeout_at};
 
 /// From the moment at which a face has an answer to that at which it is on its way, about.
 const TELLING: Duration = Duration::from_millis(2);
@@ -184,7 +184,7 @@ impl Service {
 
 /// The outcome, also one that comes at the very moment of the deadline: what is committed is told.
 async fn wait(waiter: Waiter, deadline: Instant) -> Result<Arc<Answer>, ServiceError> {
-    if let Ok(outcome) = timeout_at(deadline.into(), waiter.outcome()).await {
+    if let Ok(outcome) = timeout_at(deadline, waiter.outcome()).await {
         return outcome;
     }
     let stage = waiter.flight().stage();

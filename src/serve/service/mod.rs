@@ -5,7 +5,7 @@ mod sessions;
 
 use crate::serve::{
     config::{Config, EngineConfig},
-    engine::{Engine, EngineOptions, Failure},
+    engine::{Engine, EngineOptions, Failure, Hand},
     error::ServiceError,
     fault::Point,
     keeper::{Keeper, KeeperError},
@@ -13,12 +13,14 @@ use crate::serve::{
     registry::{Model, Registry, RegistryError},
     seat::{RETRY_AFTER_LOADING_MS, RETRY_AFTER_RESTART_MS, Seat},
     session::{KeyError, Sealer, Session},
+    store::{Home, Store},
     telemetry,
 };
 use std::{
     sync::{Arc, OnceLock},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
@@ -51,6 +53,24 @@ pub struct Service {
     draining: CancellationToken,
 }
 
+/// What a service does by [hand](Service::by_hand).
+pub struct Hands {
+    engine: Hand<Seat>,
+    store: Option<Arc<Store>>,
+}
+
+impl Hands {
+    /// One network evaluation of all acts that are at hand; false: there was none.
+    pub fn evaluate(&mut self) -> bool {
+        self.engine.turn()
+    }
+
+    /// One transaction of all that waits to be kept, and whoever waits for it is told; false: nothing waits.
+    pub fn keep(&mut self) -> bool {
+        self.store.as_ref().is_some_and(|store| store.turn())
+    }
+}
+
 impl Service {
     /// A service without models; see [`Service::set_registry`].
     ///
@@ -58,10 +78,26 @@ impl Service {
     /// If the system gives no threads for the engine, or the store cannot be opened, nothing can be recorded where it should be, or the keys of tokens
     /// cannot be read.
     pub fn start(config: Config) -> Result<Self, StartError> {
-        let recording = Writer::start(&config.record, config.models.weights)?;
-        let keeper = Keeper::open_store(&config.sessions, &config.store)?.recorded_by(recording.as_ref().map(Writer::recorder));
-        let sealer = Sealer::of(&config.tokens)?;
+        let keeper = Keeper::open_store(&config.sessions, &config.store)?;
         let engine = Engine::start(engine_options(&config.engine), config.faults.clone()).map_err(StartError::Engine)?;
+        Self::of(config, keeper, engine)
+    }
+
+    /// One whose engine and store have no threads, and what does their work in their place. Without a home sessions are in memory alone.
+    ///
+    /// # Errors
+    /// If nothing can be recorded where it should be, or the keys of tokens cannot be read.
+    pub fn by_hand(config: Config, home: Option<Arc<dyn Home>>) -> Result<(Self, Hands), StartError> {
+        let store = home.map(|home| Arc::new(Store::by_hand(home, config.store.queue_len_max)));
+        let keeper = Keeper::over(&config.sessions, &config.store, store.clone());
+        let (engine, hand) = Engine::by_hand(engine_options(&config.engine), config.faults.clone());
+        Ok((Self::of(config, keeper, engine)?, Hands { engine: hand, store }))
+    }
+
+    fn of(config: Config, keeper: Keeper, engine: Engine<Seat>) -> Result<Self, StartError> {
+        let recording = Writer::start(&config.record, config.models.weights)?;
+        let keeper = keeper.recorded_by(recording.as_ref().map(Writer::recorder));
+        let sealer = Sealer::of(&config.tokens)?;
         Ok(Self { config, registry: OnceLock::new(), keeper, engine, recording, sealer, draining: CancellationToken::new() })
     }
 

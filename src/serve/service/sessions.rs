@@ -11,10 +11,8 @@ use crate::{
         store::unix_ms,
     },
 };
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{sync::Arc, time::Duration};
+use tokio::time::Instant;
 use uuid::Uuid;
 
 /// Seeds drawn by the server stay below 2^53, so that every JSON reader keeps them exactly.

@@ -3,17 +3,14 @@
 use crate::serve::{
     engine::Patience,
     error::{ServiceError, Stage},
-    session::{Answer, Key, Outcome, Session},
+    session::{Answer, Key, Outcome, Session, lock::point},
 };
 use parking_lot::Mutex;
-use std::{
-    sync::{
-        Arc,
-        atomic::{AtomicBool, AtomicUsize, Ordering},
-    },
-    time::Instant,
+use std::sync::{
+    Arc,
+    atomic::{AtomicBool, AtomicUsize, Ordering},
 };
-use tokio::sync::watch;
+use tokio::{sync::watch, time::Instant};
 
 /// An act in flight.
 pub struct Flight {
@@ -45,6 +42,7 @@ impl Flight {
 
     /// Whether somebody waits and there is no outcome yet.
     pub fn is_wanted(&self) -> bool {
+        point();
         self.waiters.load(Ordering::Acquire) > 0 && self.outcome.borrow().is_none()
     }
 
@@ -60,6 +58,7 @@ impl Flight {
 
     /// Called by whoever holds the session's slot.
     pub(super) fn begin_storing(&self) {
+        point();
         self.storing.store(true, Ordering::Release);
     }
 
@@ -110,6 +109,7 @@ impl Flight {
 
     /// The same for whoever holds the session's slot, and has to [`Flight::leave`] afterwards.
     pub(super) fn tell(&self, outcome: Outcome) {
+        point();
         self.outcome.send_if_modified(|current| {
             let first = current.is_none();
             if first {
@@ -134,6 +134,7 @@ impl Waiter {
 
     /// None if the last one has left already.
     pub(super) fn join(session: &Arc<Session>, flight: &Arc<Flight>, patience: Patience) -> Option<Self> {
+        point();
         let one_more = |waiters| (waiters > 0 || flight.is_storing()).then_some(waiters + 1);
         flight.waiters.fetch_update(Ordering::AcqRel, Ordering::Acquire, one_more).ok()?;
         let number = flight.wait_for(patience);
@@ -164,7 +165,10 @@ impl Waiter {
 impl Drop for Waiter {
     fn drop(&mut self) {
         self.flight.patience.lock().retain(|(number, _)| *number != self.number);
-        if self.flight.waiters.fetch_sub(1, Ordering::AcqRel) == 1 && self.flight.outcome.borrow().is_none() {
+        point();
+        let is_last = self.flight.waiters.fetch_sub(1, Ordering::AcqRel) == 1;
+        point();
+        if is_last && self.flight.outcome.borrow().is_none() {
             let mut slot = self.session.slot.lock();
             if self.flight.is_storing() {
                 return;
@@ -174,71 +178,5 @@ impl Drop for Waiter {
             metrics::counter!("ada_cancelled_total", "stage" => self.flight.stage().word()).increment(1);
             self.flight.leave();
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::{
-        model::{agent::Observation, checkpoint},
-        serve::{
-            config::SessionsConfig,
-            session::{Answer, Entry, Opening, Renewal, Sessions, Standing, Timings, key_of},
-        },
-    };
-    use std::{path::Path, thread, time::Duration};
-
-    /// An act that was committed while its caller's time ran out was answered with a deadline and "nothing was changed".
-    #[test]
-    fn a_deadline_at_the_commit_is_told_the_truth() {
-        let agent = Arc::new(checkpoint::load(Path::new("models/tiny")).unwrap());
-        let (options, ttl, request_id) = (agent.config().defaults.sampler.clone(), Duration::from_secs(60), String::new());
-        let episode = agent.open(1, &options).unwrap();
-        let seen = Observation { state: vec![0.1; 4], ..Observation::default() };
-        let (after, chunk) = agent.act(&episode, &seen).unwrap();
-        let opening = Opening {
-            model: "tiny".into(),
-            agent,
-            episode: Arc::new(episode.clone()),
-            standing: Standing::default(),
-            ttl,
-            request_id,
-            known: None,
-        };
-        let session = Sessions::new(SessionsConfig::default(), None).open(opening, Instant::now()).unwrap();
-        let (mut told, mut silent) = (0, 0);
-        for turn in 0..4_000 {
-            let Ok(Entry::Lead(waiter, _)) = session.enter((None, 1), key_of(&seen), Instant::now(), Patience::default()) else {
-                panic!("it is the next")
-            };
-            let (flight, together) = (waiter.flight().clone(), AtomicUsize::new(0));
-            let (model, model_digest) = (session.model.clone(), String::new());
-            let answer =
-                Answer { session: session.id, step: 1, chunk: Arc::new(chunk.clone()), timings: Timings::default(), model, model_digest };
-            // Both begin within a moment that wanders over the commit; on a busy machine whoever arrives last is far ahead.
-            let meet = |pauses: usize| {
-                together.fetch_add(1, Ordering::AcqRel);
-                while together.load(Ordering::Acquire) < 2 {
-                    thread::yield_now();
-                }
-                (0..pauses).for_each(|_| std::hint::spin_loop());
-            };
-            let late = thread::scope(|threads| {
-                threads.spawn(|| {
-                    let after = after.clone();
-                    meet(turn % 8 * 2_000);
-                    session.commit(&flight, Arc::new(after), Arc::new(answer), None);
-                });
-                meet(turn % 100);
-                waiter.give_up()
-            });
-            assert_eq!(late.is_some(), session.summary(Instant::now()).committed_step == 1);
-            *if late.is_some() { &mut told } else { &mut silent } += 1;
-            let renewal = Renewal { seed: 1, keep_history: false };
-            let reset = session.begin_reset(renewal, None, String::new(), Instant::now()).unwrap();
-            session.finish_reset(reset, None);
-        }
-        assert!(told > 0 && silent > 0, "both orders occur: {told}, {silent}");
     }
 }

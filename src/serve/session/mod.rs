@@ -4,6 +4,7 @@ mod flight;
 mod handle;
 mod keeping;
 mod key;
+mod lock;
 mod poison;
 mod record;
 mod reset;
@@ -37,7 +38,7 @@ use crate::{
         store::{Refused, UnixMs, unix_ms},
     },
 };
-use parking_lot::Mutex;
+use lock::Lock;
 use poison::Poisons;
 use serde::{Deserialize, Serialize};
 use std::{
@@ -46,8 +47,9 @@ use std::{
         Arc,
         atomic::{AtomicUsize, Ordering},
     },
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 use uuid::Uuid;
 
 /// Longest name that a client may give a request.
@@ -143,7 +145,7 @@ pub struct Session {
     opened: UnixMs,
     /// Memory of all sessions of the table, kept up to date by each.
     bytes_total: Arc<AtomicUsize>,
-    slot: Mutex<Slot>,
+    slot: Lock<Slot>,
 }
 
 struct Slot {
@@ -209,7 +211,7 @@ impl Session {
             overtaken: false,
             mark: Mark::default(),
         };
-        Self { id, handle: Handle::of(id), model, agent, options, request_id, ttl, opened, bytes_total, slot: Mutex::new(slot) }
+        Self { id, handle: Handle::of(id), model, agent, options, request_id, ttl, opened, bytes_total, slot: Lock::new(slot) }
     }
 
     /// Takes up a step, of this episode if one is named: replays, joins or leads it, for a caller who has this patience.
@@ -402,3 +404,6 @@ impl Slot {
         held && !self.ended
     }
 }
+
+#[cfg(test)]
+mod interleaving_tests;

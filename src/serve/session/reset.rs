@@ -5,7 +5,8 @@ use crate::{
     model::agent::Episode,
     serve::{error::ServiceError, recording::Recorder, store::Version},
 };
-use std::{collections::VecDeque, sync::Arc, time::Instant};
+use std::{collections::VecDeque, sync::Arc};
+use tokio::time::Instant;
 
 /// What a new episode is made with.
 #[derive(Clone, Copy, Debug)]

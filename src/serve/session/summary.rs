@@ -2,10 +2,8 @@
 
 use super::{Handle, Session};
 use crate::{model::options::SamplerOptions, serve::store::unix_ms};
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{sync::Arc, time::Duration};
+use tokio::time::Instant;
 use uuid::Uuid;
 
 /// A session in numbers.

@@ -14,8 +14,9 @@ use std::{
         Arc,
         atomic::{AtomicUsize, Ordering},
     },
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 use uuid::Uuid;
 
 const SHARDS: usize = 16;

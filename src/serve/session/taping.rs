@@ -5,7 +5,8 @@ use crate::{
     model::agent::{Haste, Observation},
     serve::recording::{ActNote, Note, Recorder, Standing},
 };
-use std::{sync::Arc, time::Instant};
+use std::sync::Arc;
+use tokio::time::Instant;
 
 /// What is taken down of an act beside its answer.
 pub struct Taken {

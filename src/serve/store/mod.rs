@@ -106,7 +106,8 @@ pub type Name = [u8; 16];
 /// Wall clock, in milliseconds since 1970.
 pub type UnixMs = u64;
 
-/// Now, by the wall clock as it stood when it was first asked, and the time that went by since: a clock that is set must not end sessions.
+/// Now, by the wall clock as it stood when it was first asked, and the time that went by since: a clock that is set must not end sessions. Of all clocks of
+/// the server this one alone is no simulation's to stop: it has to go on from one process to the next.
 pub fn unix_ms() -> UnixMs {
     static FIRST: LazyLock<(Instant, UnixMs)> = LazyLock::new(|| {
         let wall = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);

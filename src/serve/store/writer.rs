@@ -9,8 +9,9 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
     thread::{self, Builder, JoinHandle},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 /// Writes of one transaction: more than the acts of any tick, and few enough that the first one does not wait for long.
 const GROUP_MAX: usize = 256;
@@ -44,11 +45,12 @@ struct Health {
     failed: Option<StoreError>,
 }
 
-/// A home and the thread that writes to it. Dropping it writes what still waits.
+/// A home and the thread that writes to it, or whoever does in its place ([`Store::by_hand`]). Dropping it writes what still waits.
 pub struct Store {
     home: Arc<dyn Home>,
     queue: Arc<Queue>,
     len_max: usize,
+    is_by_hand: bool,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
@@ -58,10 +60,31 @@ impl Store {
     /// # Errors
     /// If the system gives no thread.
     pub fn start(home: Arc<dyn Home>, len_max: usize) -> io::Result<Self> {
+        let store = Self::of(home, len_max, false);
+        let (home, queue) = (store.home.clone(), store.queue.clone());
+        let thread = Builder::new().name("ada-store".into()).spawn(move || run(&*home, &queue))?;
+        *store.thread.lock() = Some(thread);
+        Ok(store)
+    }
+
+    /// Without a thread: what waits is written by whoever calls [`Store::turn`].
+    pub fn by_hand(home: Arc<dyn Home>, len_max: usize) -> Self {
+        Self::of(home, len_max, true)
+    }
+
+    fn of(home: Arc<dyn Home>, len_max: usize, is_by_hand: bool) -> Self {
         let queue = Arc::new(Queue { waiting: Mutex::default(), arrived: Condvar::new(), health: Mutex::default() });
-        let (its_home, its_queue) = (home.clone(), queue.clone());
-        let thread = Builder::new().name("ada-store".into()).spawn(move || run(&*its_home, &its_queue))?;
-        Ok(Self { home, queue, len_max, thread: Mutex::new(Some(thread)) })
+        Self { home, queue, len_max, is_by_hand, thread: Mutex::default() }
+    }
+
+    /// Writes what waits, in one transaction; false: nothing did.
+    pub fn turn(&self) -> bool {
+        let group = self.queue.waiting.lock().group();
+        let waited = !group.is_empty();
+        if waited {
+            write(&*self.home, &self.queue, group);
+        }
+        waited
     }
 
     /// Writes, and tells what became of it: from the writer's thread, in the order of submission, or at once where too many wait. One that is dropped untold
@@ -138,6 +161,8 @@ impl Store {
         if let Some(thread) = thread.filter(|thread| thread.thread().id() != thread::current().id()) {
             join_until(thread, Instant::now() + PATIENCE);
         }
+        // A disk that hangs has a thread to hang.
+        while self.is_by_hand && self.turn() {}
     }
 }
 
@@ -149,7 +174,7 @@ impl Drop for Store {
 
 fn run(home: &dyn Home, queue: &Queue) {
     loop {
-        let (writes, told): (Vec<Write>, Vec<Told>) = {
+        let group = {
             let mut waiting = queue.waiting.lock();
             while waiting.writes.is_empty() {
                 if waiting.closed {
@@ -157,16 +182,29 @@ fn run(home: &dyn Home, queue: &Queue) {
                 }
                 queue.arrived.wait(&mut waiting);
             }
-            let count = waiting.writes.len().min(GROUP_MAX);
-            waiting.writes.drain(..count).unzip()
+            waiting.group()
         };
-        let begin = Instant::now();
-        queue.health.lock().busy_since = Some(begin);
-        let outcome = apart(|| home.write(&writes)).unwrap_or_else(|| Err(StoreError::Unavailable("it panicked over a commit".into())));
-        queue.health.lock().ended(&outcome);
-        metrics::histogram!("ada_store_op_duration_seconds", "op" => "write").record(begin.elapsed().as_secs_f64());
-        metrics::histogram!("ada_store_group_size").record(writes.len() as f64);
-        tell(outcome, told.into_iter());
+        write(home, queue, group);
+    }
+}
+
+/// One transaction.
+fn write(home: &dyn Home, queue: &Queue, group: Vec<(Write, Told)>) {
+    let (writes, told): (Vec<Write>, Vec<Told>) = group.into_iter().unzip();
+    let begin = Instant::now();
+    queue.health.lock().busy_since = Some(begin);
+    let outcome = apart(|| home.write(&writes)).unwrap_or_else(|| Err(StoreError::Unavailable("it panicked over a commit".into())));
+    queue.health.lock().ended(&outcome);
+    metrics::histogram!("ada_store_op_duration_seconds", "op" => "write").record(begin.elapsed().as_secs_f64());
+    metrics::histogram!("ada_store_group_size").record(writes.len() as f64);
+    tell(outcome, told.into_iter());
+}
+
+impl Waiting {
+    /// The next transaction.
+    fn group(&mut self) -> Vec<(Write, Told)> {
+        let count = self.writes.len().min(GROUP_MAX);
+        self.writes.drain(..count).collect()
     }
 }
 

@@ -91,6 +91,18 @@ fn the_network_and_the_clock_stay_with_the_server() {
     hold(&["UdpSocket", "TcpStream", "TcpListener"], &["serve/"]);
 }
 
+/// Tokio's, which a simulation can stop and let go on: an act that waits by one clock and is late by another one is late at once, or never.
+#[test]
+fn the_server_has_one_clock() {
+    let is_of_std = |import: &str| import.starts_with("std::") && names(import, "Instant");
+    let has_another = |code: &str| code.split("use ").filter_map(|rest| rest.split_once(';')).any(|(import, _)| is_of_std(import));
+    assert!(has_another("use std::{io, time::{Duration, Instant}};") && !has_another("use std::time::Duration; use tokio::time::Instant;"));
+    // Of the wall clock, which goes on from one process to the next.
+    let serve = code().into_iter().filter(|(path, _)| path.starts_with("serve/") && path != "serve/store/mod.rs");
+    let found: Vec<_> = serve.filter(|(_, code)| has_another(code) || code.contains("std::time::Instant")).map(|(path, _)| path).collect();
+    assert_eq!(found, Vec::<String>::new(), "use tokio::time::Instant");
+}
+
 #[test]
 fn wire_types_stay_in_their_face() {
     hold(&["pb", "include_proto"], &["serve/grpc/"]);

@@ -18,8 +18,9 @@ use ada_diffuser::{
 use std::{
     panic::panic_any,
     sync::{Arc, mpsc},
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 pub type Outcome = Result<Finished, Failure>;
 

@@ -20,6 +20,7 @@ mod recordings;
 mod records;
 mod steps;
 mod store;
+mod stories;
 mod streams;
 mod tokens;
 

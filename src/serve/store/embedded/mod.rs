@@ -13,7 +13,9 @@ use super::{Change, Durability, Ending, Head, Home, Name, Place, Refused, Size, 
 use crate::serve::session::Handle;
 use medium::Medium;
 use parking_lot::{Mutex, RwLock};
-use redb::{Builder, Database, ReadableDatabase, ReadableTable, ReadableTableMetadata, Table, TableDefinition, WriteTransaction};
+use redb::{
+    Builder, Database, ReadableDatabase, ReadableTable, ReadableTableMetadata, StorageBackend, Table, TableDefinition, WriteTransaction,
+};
 use std::{
     fs::DirBuilder,
     io,
@@ -25,8 +27,9 @@ use std::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
-    time::{Duration, Instant},
+    time::Duration,
 };
+use tokio::time::Instant;
 
 type Key = [u8; 16];
 
@@ -96,6 +99,15 @@ impl Embedded {
         DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|error| refused(error.into()))?;
         let open = move |builder: &Builder| Ok(builder.create_with_backend(Medium::open(&file, options, lost.clone())?)?);
         Self::on(Box::new(open), path, options, is_lost)
+    }
+
+    /// Over a medium of another kind, that is opened the first time, and anew after an error.
+    ///
+    /// # Errors
+    /// If it cannot be opened, or what is on it is damaged.
+    pub fn over<M: StorageBackend>(medium: impl Fn() -> M + Send + Sync + 'static, options: Options) -> Result<Self, StoreError> {
+        let open = move |builder: &Builder| Ok(builder.create_with_backend(medium())?);
+        Self::on(Box::new(open), PathBuf::new(), options, Arc::default())
     }
 
     fn on(open: Open, path: PathBuf, options: Options, is_lost: Arc<AtomicBool>) -> Result<Self, StoreError> {

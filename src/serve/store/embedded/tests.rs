@@ -1,6 +1,5 @@
 use super::*;
 use crate::serve::store::{Store, VERSION_LEN};
-use redb::StorageBackend;
 use uuid::Uuid;
 
 const OPTIONS: Options = Options { durability: Durability::Process, cache_bytes: 1 << 20, len_max: 1_000, bytes_max: 1 << 30 };
@@ -142,8 +141,7 @@ impl Noted {
 
     fn home(&self) -> Result<Embedded, StoreError> {
         let medium = self.clone();
-        let open = move |builder: &Builder| Ok(builder.create_with_backend(medium.clone())?);
-        Embedded::on(Box::new(open), PathBuf::new(), OPTIONS, Arc::default())
+        Embedded::over(move || medium.clone(), OPTIONS)
     }
 }
 
