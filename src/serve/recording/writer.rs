@@ -111,6 +111,8 @@ struct Work {
     stopped: Instant,
     /// It is full, and a turn is on its way.
     turns: bool,
+    /// The turn has come: the next entry begins a file. One without any would be a recording of nothing.
+    is_due: bool,
     /// Entries that are to be told as lost.
     lost: u64,
     /// What is about to be written, how many notes it is, and how many it tells as lost.
@@ -122,7 +124,20 @@ struct Work {
 impl Work {
     fn new(config: RecordConfig, weights: Precision, recorder: Arc<Recorder>) -> Self {
         let (begun, buffer) = (Instant::now(), Vec::with_capacity(WRITE_LEN));
-        Self { config, weights, recorder, file: None, begun, stopped: begun, turns: false, lost: 0, buffer, buffered: 0, told: 0 }
+        Self {
+            config,
+            weights,
+            recorder,
+            file: None,
+            begun,
+            stopped: begun,
+            turns: false,
+            is_due: false,
+            lost: 0,
+            buffer,
+            buffered: 0,
+            told: 0,
+        }
     }
 
     fn run(mut self) {
@@ -159,7 +174,8 @@ impl Work {
         let mut bytes = Vec::new();
         format::write(&Entry::Header(header), &mut bytes).map_err(io::Error::other)?;
         let room = (self.config.file_bytes_max, self.config.dir_bytes_max);
-        (self.file, self.begun, self.turns) = (Some(Open::begin(&self.config.dir, room, &bytes)?), Instant::now(), false);
+        (self.file, self.begun) = (Some(Open::begin(&self.config.dir, room, &bytes)?), Instant::now());
+        (self.turns, self.is_due) = (false, false);
         metrics::gauge!("ada_record_stopped").set(0.0);
         if self.recorder.is_shut() {
             self.recorder.open();
@@ -195,8 +211,11 @@ impl Work {
         for note in notes {
             if let Note::Turn = note {
                 self.flush(left)?;
-                self.begin()?;
+                self.is_due = true;
                 continue;
+            }
+            if self.is_due {
+                self.begin()?;
             }
             self.put(note, left);
             if self.buffer.len() >= WRITE_LEN {

@@ -76,7 +76,7 @@ impl World {
 
     /// Somebody asks for the first act, and has no time to wait; says what it is told.
     fn ask(&self) -> Option<Arc<Answer>> {
-        match self.session.enter((Some(0), 1), ACT.key, Instant::now(), Patience::default()) {
+        match self.session.enter((Some(0), 1), ACT.key, Instant::now(), Default::default()) {
             Ok(Entry::Replay(answer)) => Some(answer),
             Ok(Entry::Join(waiter)) => waiter.give_up(),
             Ok(Entry::Lead(waiter, _)) => {
@@ -94,7 +94,7 @@ impl World {
     /// Somebody asks for it and waits for as long as it takes; None: there is another episode by now.
     fn wait(&self) -> Option<Arc<Answer>> {
         let (waiter, engine) = loop {
-            match self.session.enter((Some(0), 1), ACT.key, Instant::now(), Patience::default()) {
+            match self.session.enter((Some(0), 1), ACT.key, Instant::now(), Default::default()) {
                 Ok(Entry::Replay(answer)) => return Some(answer),
                 Ok(Entry::Join(waiter)) => break (waiter, None),
                 Ok(Entry::Lead(waiter, _)) => {
@@ -142,7 +142,7 @@ impl World {
             assert!(count <= 1, "the act was kept {count} times");
         }
         assert_eq!(self.sessions.bytes(), episode.size_bytes(), "of each episode once");
-        let next = self.session.enter((Some(at.0), at.1 + 1), ACT.key, Instant::now(), Patience::default());
+        let next = self.session.enter((Some(at.0), at.1 + 1), ACT.key, Instant::now(), Default::default());
         assert!(matches!(next, Ok(Entry::Lead(..))), "it is stuck");
         at
     }
