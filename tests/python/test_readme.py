@@ -53,6 +53,9 @@ IN_FULL = ("docs/simulator.md",)
 SHORT_RECIPES = [(r"^steps = \d+", "steps = 2"), (r"\b(filter|successor_state) = [\d.]+", r"\1 = 1000.0")]
 """Replaced in every recipe: two steps of training, and a gate that lets them pass."""
 
+SHORT_WORDS = (r"\b(stages\.\w+\.steps=)\d+", r"\g<1>2")
+"""The same of steps that a command, or a file that the reader writes, asks for itself."""
+
 GIVEN = {
     "env": "import gymnasium; env = gymnasium.make('ada_diffuser.environments:ada/CheetahWind-S-v0')",
     "client": "from ada_diffuser import Client; client = Client('grpc://127.0.0.1:7777')",
@@ -122,7 +125,7 @@ class Checkout:
     """A clone with everything built: what is tracked and what was built, the commands shortened, and none of a run's outputs."""
 
     def __init__(self, folder: Path, *, shortened: bool) -> None:
-        self.folder = folder
+        self.folder, self.shortened = folder, shortened
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = str(free.getsockname()[1])
         for path in ROOT.iterdir():
@@ -130,7 +133,7 @@ class Checkout:
                 (folder / path.name).symlink_to(path)
         shutil.copytree(ROOT / "report", folder / "report")
         self._models()
-        self._commands(shortened)
+        self._commands()
         self.path = f"{folder / '.venv/bin'}:{folder / 'target/release'}:{os.environ['PATH']}"
 
     def _models(self) -> None:
@@ -141,13 +144,13 @@ class Checkout:
                 text = re.sub(pattern, short, text, flags=re.MULTILINE)
             recipe.write_text(text, encoding="utf-8")
 
-    def _commands(self, shortened: bool) -> None:
+    def _commands(self) -> None:
         scripts, built = self.folder / ".venv/bin", self.folder / "target/release"
         scripts.mkdir(parents=True)
         built.mkdir(parents=True)
         for name, flags in SHORT_FLAGS.items():
             module = f"ada_diffuser.commands.{name.removeprefix('ada-')}"
-            added = f"{flags if shortened else ''} {PLACE_FLAGS.get(name, '')}"
+            added = f"{flags if self.shortened else ''} {PLACE_FLAGS.get(name, '')}"
             self._script(scripts / name, f'exec {sys.executable} -m {module} "$@" {added}')
         self._script(scripts / "cargo", "exit 0")
         (scripts.parent / ".ready").touch()
@@ -173,10 +176,14 @@ class Checkout:
         environment = {**os.environ, "PATH": self.path}
         for name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS"):  # those of a `make test` around this one
             environment.pop(name, None)
-        command = [word.replace("7777", self.port) for word in command]
+        command = [self.short(word).replace("7777", self.port) for word in command]
         done = subprocess.run(command, cwd=self.folder, env=environment, capture_output=True, text=True, timeout=500, check=False)
         assert done.returncode == 0, f"{command[-1]}\nended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
         return done.stdout + done.stderr
+
+    def short(self, text: str) -> str:
+        """What is asked for in it, in two steps."""
+        return re.sub(*SHORT_WORDS, text) if self.shortened else text
 
     def stop_server(self) -> None:
         with suppress(FileNotFoundError, ProcessLookupError):
@@ -197,7 +204,7 @@ def run(example: Example, checkout: Checkout) -> str:
         case "file", _:
             path = checkout.folder / example.words
             assert not path.exists(), f"{path.name} is there already"
-            path.write_text(example.text, encoding="utf-8")
+            path.write_text(checkout.short(example.text), encoding="utf-8")
         case "run by", _:
             runner = (ROOT / example.words).read_text(encoding="utf-8")
             commands = [line.split("#")[0].strip() for line in example.text.splitlines()]
