@@ -307,13 +307,17 @@ impl Sessions {
         for _ in 0..LOOKS_MAX {
             let Some((_, handle)) = self.unused.lock().first(idle_min, now) else { break };
             let mut shard = self.shard(handle).lock();
-            let session = shard.live.get(&handle).cloned();
-            if session.is_some_and(|session| session.is_unused() && self.is_ours(&session) && session.end_if_idle(idle_min, now)) {
+            let Some(session) = shard.live.get(&handle).cloned().filter(|session| session.is_unused()) else {
+                // It has ended, or was asked for, a moment ago.
+                self.unused.lock().forget(handle);
+                continue;
+            };
+            if self.is_ours(&session) && session.end_if_idle(idle_min, now) {
                 self.make_go(&mut shard, handle, now);
                 return true;
             }
-            // It has ended, or was asked for, a moment ago.
-            self.unused.lock().forget(handle);
+            // Somebody has it in hand, and may never ask for it: forgotten here it would hold its place until its time to live is over.
+            self.unused.lock().file(handle, now);
         }
         false
     }

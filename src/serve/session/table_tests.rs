@@ -1,7 +1,13 @@
 //! The table: places, and who gives them.
 
 use super::*;
-use crate::{model::checkpoint, serve::session::Standing};
+use crate::{
+    model::checkpoint,
+    serve::{
+        session::Standing,
+        store::{Durability, Embedded, Options},
+    },
+};
 use std::path::Path;
 
 const MINUTE: Duration = Duration::from_secs(60);
@@ -80,4 +86,21 @@ fn a_refusal_looks_at_a_few() {
     assert_eq!(sessions.get(*idle, now).err(), Some(ServiceError::SessionEvicted));
     assert!(sessions.open(opening(), now).is_err());
     assert!(sessions.idle.lock().first(MINUTE, now).is_none(), "and then none is looked at");
+}
+
+/// One that is opened while another one wants its place, and that nobody asks for then, held that place for as long as it lived.
+#[test]
+fn who_was_in_hand_gives_its_place_later() {
+    let (_, opening) = table(1);
+    let dir = tempfile::tempdir().unwrap();
+    let options = Options { durability: Durability::Process, cache_bytes: 1 << 20, len_max: 10, bytes_max: 1 << 30 };
+    let store = Store::by_hand(Arc::new(Embedded::open(dir.path(), options).unwrap()), 10);
+    let sessions = Sessions::new(SessionsConfig { len_max: 1, ..SessionsConfig::default() }, Some(Arc::new(store)));
+    let (begin, soon) = (Instant::now(), Instant::now() + MINUTE);
+    let in_hand = sessions.open(opening(), begin).unwrap();
+    let also = in_hand.clone();
+    assert!(matches!(sessions.open(opening(), soon), Err(ServiceError::Quota { .. })), "it is about to be told");
+    drop((in_hand, also));
+    assert!(sessions.open(opening(), soon + MINUTE).is_ok());
+    assert_eq!(sessions.len(), 1);
 }
