@@ -9,7 +9,8 @@ use std::path::PathBuf;
 /// when the disk is full or fails, which of engine, store and network comes first.
 ///
 /// A violation is an act that was acknowledged and is not there, is not the one, or was computed twice; a session or a store that cannot be read; a session
-/// that nobody answers for a minute. Each is told with its seed: --first SEED --seeds 1 lives it again.
+/// that nobody answers for a minute. Each is told with its seed: --first SEED --seeds 1 lives it again, but for the
+/// ids of sessions, which are random: what hangs on their order may need some tries.
 #[derive(Clone, Debug, Parser)]
 #[command(name = "simulate")]
 pub struct Flags {

@@ -35,7 +35,8 @@ fn what_is_wrong_in_a_story_is_found_out() {
     assert!(noise.sum.different > 0, "{noise}");
 }
 
-/// A story that is lived again is the same one: what happens to whom, and what they see of it.
+/// A story that is lived again is the same one: what happens to whom, and what they see of it. (Ids of sessions are random, and nothing hangs on their order
+/// in these two.)
 #[test]
 fn a_seed_tells_the_whole_story() {
     let again = || live("--first 7 --seeds 2 --jobs 1");
